@@ -21,9 +21,9 @@ from jaxmark.geometry.surfaces import Moments, surface_moments, volume_moments
 from jaxmark.spectral.padding import common_size
 
 SPACING = 3.4  # spacing of the lattice, in widths of the narrow Gaussian
-_WIDER = 2.0  # width of the wide Gaussian over the narrow one
+WIDER = 2.0  # width of the wide Gaussian over the narrow one
 _CUT = 3.2  # widths of the wide Gaussian at which it is cut off
-REACH = _CUT * _WIDER  # distance, in widths of the narrow Gaussian, beyond which nothing changes a value
+REACH = _CUT * WIDER  # distance, in widths of the narrow Gaussian, beyond which nothing changes a value
 _PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # largest size of pieces: in squared widths, and widths, of the narrow Gaussian
 _GROUP = 256  # pieces in a group
 _NO_PIECE = _NO_ANCHOR = 2**31 - 1  # the index that padding belongs to
@@ -306,7 +306,7 @@ def look(
         undone: blur that the surface already has, as a share of the narrow Gaussian's variance; the averages are made
             narrower by it.
     """
-    narrow, wide = width**2 * (1 - undone), width**2 * (_WIDER**2 - undone)
+    narrow, wide = width**2 * (1 - undone), width**2 * (WIDER**2 - undone)
     dtype, is_piece = surface.points.dtype, anchors.around >= 0
     positions = jnp.asarray(anchors.places, dtype) + shift
     offset = surface.points[anchors.around] - positions[jnp.minimum(anchors.anchor, len(positions) - 1)][:, None]

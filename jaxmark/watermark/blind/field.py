@@ -7,26 +7,30 @@ of smoothing steps undone. Its pose is nearly that of the marked mesh, up to hal
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64, Int
+from scipy.spatial.transform import Rotation
+from scipy.special import ndtr
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, edges
+from jaxmark.geometry.pose import Pose
 from jaxmark.geometry.surfaces import Moments, surface_moments, volume_moments
 from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import common_laplacian, pad_rows
 from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.blind.anchors import Anchors, Changes, Pieces, changes, encloses, look, place, see, turned
-from jaxmark.watermark.blind.hint import MOST_POSES, Hint, Posed
+from jaxmark.watermark.blind.anchors import WIDER, Anchors, Changes, Pieces, changes, encloses, look, place, see, turned
+from jaxmark.watermark.blind.hint import GROUPS, MOST_POSES, Hint, Posed
 from jaxmark.watermark.blind.landmarks import Border
-from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
+from jaxmark.watermark.blind.scheme import LOOKS_AGAIN, AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.coding.keys import Choices
 
 _LEAST_AREA = 0.2  # lower limit on the area of a vertex, relative to the mean
@@ -44,7 +48,9 @@ _STEP_SIZE = 0.1
 _SPREAD = (*(3.5e-3,) * 3, *(4e-4,) * 3, 2.5e-3)
 #: The same for a pose that a hint gave, with shifts in widths.
 _TURN, _SHIFT, _GROWTH = 6e-3, 0.12, 2.5e-3
-_RIM = 3.2  # least distance of the anchors of a part from its border, in widths
+_STARTS, _SMALLER = 4096, 0.5  # changes of such a pose that are tried; factor on them where a suspect is seen again
+_RIM = 2.0  # least distance of the anchors of a part from its border, in widths
+_LOST = 1.2  # error of a value, in widths, over the share of the wide average that lies beyond a border
 #: The half turns of a shape about its axes; the last four are of its mirror image.
 TURNS = np.array(
     [[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, -1]], np.int64
@@ -80,7 +86,7 @@ class FieldScheme(BlindScheme):
     def looks(self) -> int:
         """See `BlindScheme`."""
         in_own_pose = (len(_UNDONE_STEPS) - 1 + len(_BLURS)) * len(TURNS)
-        return in_own_pose + (MOST_POSES * len(_BLURS) if self.hint else 0)
+        return in_own_pose + (MOST_POSES * len(_BLURS) + GROUPS * LOOKS_AGAIN if self.hint else 0)
 
     def hosts(self, original: Original, choices: Choices) -> dict[float, AnchoredHost]:
         """See `BlindScheme`.
@@ -162,37 +168,63 @@ class FieldScheme(BlindScheme):
                 undone,
                 TURNS.prod(axis=1) < 0,
             )
-            for width, anchors, view in self._seen(placement.mesh, _BLURS if undone == 0 else _BLURS[:1])
+            for width, _, anchors, view in self._seen(placement.mesh, _BLURS if undone == 0 else _BLURS[:1])
         ]
 
-    def _in_pose(self, suspect: Mesh, posed: Posed) -> list[Look]:
-        """See a suspect, which may be a part, in a pose that a hint gave; none if its surface is too large for it."""
+    def _in_pose(self, suspect: Mesh, posed: Posed, blurs: Sequence[float] = _BLURS, factor: float = 1.0) -> list[Look]:
+        """See a suspect, which may be a part, in a pose that a hint gave; none if its surface is too large for it.
+
+        Args:
+            suspect: the suspect in the coordinates of its file.
+            posed: its pose.
+            blurs: the blurs that remeshing may have caused.
+            factor: factor on the small changes of pose that are tried.
+        """
         mesh = posed.apply(suspect)
         border, looks = Border(mesh), []
         with suppress(JaxmarkError):
-            for width, anchors, view in self._seen(mesh, _BLURS):
+            for width, blur, anchors, view in self._seen(mesh, blurs):
                 places = np.asarray(anchors.places)
-                good = np.asarray(view.shown.good) & border.spares(places, _RIM * width)
+                distance = border.distances(places)
+                good = np.asarray(view.shown.good) & (distance >= _RIM * width)
                 # A turn about the centre of the part moves it less than a turn about the origin.
                 centre = places[good].mean(axis=0) if good.any() else np.zeros(3)
-                spread = (*(_TURN,) * 3, *(_SHIFT * width,) * 3, _GROWTH)
+                spread = np.array((*(_TURN,) * 3, *(_SHIFT * width,) * 3, _GROWTH))
                 looks.append(
                     Look(
                         anchors.cells[None],
                         view.shown.values,
                         good,
                         _by_pose(view, places - centre),
-                        spread,
+                        tuple((factor * spread).tolist()),
                         width,
                         posed.pose,
                         0,
                         np.array([posed.pose.mirrors]),
                         by_hint=True,
+                        error=_LOST * width * ndtr(-distance / (WIDER * width)),
+                        starts=_STARTS,
+                        again=partial(self._again, suspect, posed, width, centre, blur),
                     )
                 )
         return looks
 
-    def _seen(self, mesh: Mesh, blurs: Sequence[float]) -> Iterator[tuple[float, Anchors, Changes]]:
+    def _again(
+        self,
+        suspect: Mesh,
+        posed: Posed,
+        width: float,
+        centre: Float64[np.ndarray, " 3"],
+        blur: float,
+        change: Float64[np.ndarray, " changes"],
+    ) -> Look | None:
+        """See a suspect again after a small change of its pose about a centre, which moved the anchors; see `Look`."""
+        matrix = (1 + change[6]) * Rotation.from_rotvec(change[:3]).as_matrix()
+        motion = Pose(matrix, centre - matrix @ centre + change[3:6])
+        changed = posed._replace(pose=posed.pose.then(motion.inverse()))
+        return next(iter(replace(self, widths=(width,))._in_pose(suspect, changed, (blur,), _SMALLER)), None)
+
+    def _seen(self, mesh: Mesh, blurs: Sequence[float]) -> Iterator[tuple[float, float, Anchors, Changes]]:
         """Measure the values of a surface for each width and blur.
 
         Raises:
@@ -201,7 +233,12 @@ class FieldScheme(BlindScheme):
         dtype = jnp.result_type(float)
         for width, (_, surface, anchors) in see(mesh, self.widths, dtype).items():
             for blur in blurs:
-                yield width, anchors, changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype))
+                yield (
+                    width,
+                    blur,
+                    anchors,
+                    changes(surface, anchors, jnp.asarray(width, dtype), jnp.asarray(blur, dtype)),
+                )
 
 
 def _by_pose(view: Changes, places: Float64[np.ndarray, "anchors 3"]) -> Float[Array, "anchors 7"]:

@@ -78,12 +78,15 @@ class Border:
         points = ((1 - share) * start + share * end).reshape(-1, 3)
         self._tree = KDTree(points) if len(points) else None
 
+    def distances(self, places: _Vectors, farthest: float = np.inf) -> Float64[np.ndarray, " points"]:
+        """Compute the distances of places from the border; infinite beyond `farthest`, or if there is no border."""
+        if self._tree is None:
+            return np.full(len(places), np.inf)
+        return np.asarray(self._tree.query(places, distance_upper_bound=farthest)[0])
+
     def spares(self, places: _Vectors, distance: float) -> Bool[np.ndarray, " points"]:
         """Return a mask of the places that are at least so far away from the border."""
-        if self._tree is None:
-            return np.ones(len(places), bool)
-        nearest, _ = self._tree.query(places, distance_upper_bound=distance)
-        return ~np.isfinite(np.asarray(nearest))
+        return np.isinf(self.distances(places, distance))
 
 
 def find_landmarks(mesh: Mesh, widths: Sequence[float]) -> Landmarks:

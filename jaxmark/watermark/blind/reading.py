@@ -1,9 +1,10 @@
 """Reading of phases without the original, and the bound on the probability of a score.
 
 **The bound.** The phase of an anchor is its value divided by the quantisation step, minus its offset δ; c is the cosine
-of 2π times the phase. With the key's sign (-1)^b, from another subkey, and the code bit a of the anchor's slot, the
-score is S = Σ a (-1)^b c. Everything that depends only on the suspect and the offsets is independent of the signs: the
-pose, the step, and the choice of anchors. Given these, S is a sum of independent signs times c, and
+of 2π times the phase, times the reliability of the value, which is less than 1 beside a border. With the key's sign
+(-1)^b, from another subkey, and the code bit a of the anchor's slot, the score is S = Σ a (-1)^b c. Everything that
+depends only on the suspect and the offsets is independent of the signs: the pose, the step, the choice of anchors, and
+their reliability. Given these, S is a sum of independent signs times c, and
 P(S ≥ t) ≤ exp(-t²/(2 Σ c²)) (Hoeffding 1963). The denominator is that of the chosen pose, so that a search which makes
 all c² large also increases it. Each reading whose score is compared is charged, whether it was made or not.
 
@@ -23,8 +24,8 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, compact, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.blind.dither import make_dither
-from jaxmark.watermark.blind.scheme import BlindScheme, Look
-from jaxmark.watermark.blind.search import moved, search
+from jaxmark.watermark.blind.scheme import LOOKS_AGAIN, BlindScheme, Look
+from jaxmark.watermark.blind.search import moved, random_changes, reliability, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
 from jaxmark.watermark.coding.message import decode_any, encode
 from jaxmark.watermark.evidence import ledger
@@ -47,10 +48,12 @@ class Phases(NamedTuple):
     view: Look
     turn: int
     step: float
+    change: Float64[np.ndarray, " changes"]
     pilot: float  # fit of the offsets, see `Found`
     soft: Float64[np.ndarray, " code"]  # soft decisions of the code bits
     square: float  # Σ c²
     anchors: int  # number of anchors that count
+    reliable: float  # sum of their reliabilities
 
     @property
     def anchored(self) -> "Anchored":
@@ -65,7 +68,7 @@ class Anchored(NamedTuple):
     width: float = 0.0  # width of the averages, in the scheme's unit
     step: float = 0.0  # quantisation step of the values, in the scheme's unit
     anchors: int = 0  # number of values that were read
-    agreement: float = 0.0  # mean cosine of their phases; 1 if all have exactly the values of the mark
+    agreement: float = 0.0  # mean cosine of their phases by reliability; 1 if all have exactly the values of the mark
 
     def facts(self) -> dict[str, Any]:
         """See `Registration`."""
@@ -133,10 +136,13 @@ def read(
     looks = kinds * scheme.looks * _CHANGES
     best = _nothing(scheme, claim, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
+    poses: set[bytes] = set()  # poses that the hint gave
     for group in scheme.views(suspect, choices):
+        poses |= {view.pose.shift.tobytes() for view in group if view.by_hint}
         readings = [reading for view in group for reading in _readings(view, scheme, choices, length)]
         if not readings:
             continue
+        readings += _readings_again(readings, scheme, choices, length)
         detection = _weigh(readings, scheme, claim, looks, tags_compared)
         tags_compared += len(readings) * _CANDIDATES
         best = min(
@@ -146,7 +152,17 @@ def read(
         )
         if is_sure(best):
             break
+    if record is not None and record.parameters.get("hint") and not best.detected(allow_estimate=True):
+        return best._replace(notes=(*best.notes, _note_on_poses(len(poses))))
     return best
+
+
+def _note_on_poses(count: int) -> str:
+    """Say whether the hint of a record gave poses of a suspect in which nothing was detected."""
+    if count == 0:
+        return "The record's hint gives no pose of this suspect: too few landmarks of the original are found on it."
+    tried = "one pose" if count == 1 else f"{count} poses"
+    return f"The record's hint gives {tried} of this suspect, but what is read there does not prove the mark."
 
 
 def try_each(reads: Iterable[Callable[[], Detection]]) -> Iterator[Detection]:
@@ -190,6 +206,7 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
     if not len(counted):
         return []
     dtype, steps = view.values.dtype, np.asarray(scheme.steps)
+    errors = np.broadcast_to(view.error, view.good.shape)
     offsets, choices_per_turn = np.zeros(view.names.shape[:2]), []
     for turn, names in enumerate(view.names):
         names, group = np.unique(names[counted], axis=0, return_inverse=True)
@@ -199,21 +216,38 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
     fit = search(
         view.values,
         view.changes,
-        jnp.asarray(view.good, dtype),
+        jnp.asarray(view.good * reliability(errors, steps[:, None], 2), dtype),
         jnp.asarray(offsets, dtype),
         jnp.asarray(steps, dtype),
         jnp.asarray(view.spread, dtype),
+        jnp.asarray(random_changes(view.starts, len(view.spread)), dtype),
     )
     changes, pilots = np.asarray(fit.change, np.float64), np.asarray(fit.pilot, np.float64)
     readings = []
     for turn, (dither, group) in enumerate(choices_per_turn):
         for rung, step in enumerate(steps):
+            reliable = reliability(errors[counted], step, 1)
             for change, pilot in ((np.zeros(len(view.spread)), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
                 cosines = np.cos(2 * np.pi * (moved(view, change)[counted] / step - offsets[turn, counted]))
-                cosine = np.bincount(group, cosines) / np.bincount(group)
-                soft = np.bincount(dither.slot, dither.sign * cosine, length)
-                readings.append(Phases(view, turn, float(step), pilot, soft, float(cosine @ cosine), len(cosine)))
+                cosine = np.bincount(group, reliable * cosines) / np.bincount(group)
+                soft, square = np.bincount(dither.slot, dither.sign * cosine, length), float(cosine @ cosine)
+                mean = float(np.sum(np.bincount(group, reliable) / np.bincount(group)))
+                readings.append(Phases(view, turn, float(step), change, pilot, soft, square, len(cosine), mean))
     return readings
+
+
+def _readings_again(readings: list[Phases], scheme: BlindScheme, choices: Choices, length: int) -> list[Phases]:
+    """See the suspect again after the change of pose that fits the offsets best, and read it, several times.
+
+    Values are not quite linear in the change, so that a view from nearer the right pose shows more.
+    """
+    found: list[Phases] = []
+    for _ in range(LOOKS_AGAIN):
+        best = max((one for one in readings if one.view.again is not None), key=lambda one: one.pilot, default=None)
+        view = None if best is None or best.view.again is None else best.view.again(best.change)
+        readings = [] if view is None else _readings(view, scheme, choices, length)
+        found += readings
+    return found
 
 
 class _Claim(NamedTuple):
@@ -263,7 +297,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
         notes.append("The suspect was read in a pose that was found by the record's hint, as parts are.")
     if reading.view.mirrored[reading.turn]:
         notes.append("The suspect is the mirror image of the marked mesh.")
-    agreement = float(score[chosen] / reading.anchors)
+    agreement = float(score[chosen] / max(reading.reliable, 1e-300))
     return _nothing(scheme, claim, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
         recorded=None if decoded is None else is_recorded(record, decoded.message, choices),

@@ -4,7 +4,7 @@ An *anchor* is a place on the surface that a reader finds again without the orig
 anchor, and the mark changes the values. Keyed choices depend on the anchor's *name*. See `docs/blind.md`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
@@ -33,6 +33,10 @@ def measure(
 ) -> tuple[Float[Array, " anchors"], Float[Array, " held"]]:
     """See `Measured.measure`."""
     return shape.measure(vertices)
+
+
+STARTS = 256  # small changes of a view that are tried, unless the view needs more
+LOOKS_AGAIN = 2  # number of times that a reader sees the suspect again in the likeliest view of a group
 
 
 class AnchoredHost(NamedTuple):
@@ -69,6 +73,10 @@ class Look(NamedTuple):
     undone: int  # number of smoothing steps that were undone
     mirrored: Bool[np.ndarray, " turns"]  # whether the suspect is a mirror image in this turn
     by_hint: bool = False  # whether the pose was found by the hint of a record
+    error: Float64[np.ndarray, " anchors"] | float = 0.0  # standard deviation of values because of a border beside them
+    starts: int = STARTS  # number of small changes that are tried
+    #: Sees the suspect again after a small change of the view; None where that is not worth the time.
+    again: "Callable[[Float64[np.ndarray, ' changes']], Look | None] | None" = None
 
 
 @runtime_checkable
@@ -88,7 +96,7 @@ class BlindScheme(Protocol):
 
     @property
     def looks(self) -> int:
-        """The largest number of views of a suspect with one width, times the number of turns."""
+        """The largest number of views of a suspect with one width, also of those seen again, times that of turns."""
         ...
 
     def fixed(self, width: float, step: float, **recorded: str) -> "BlindScheme":

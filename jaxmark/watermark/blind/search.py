@@ -10,11 +10,25 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Float64
+from numpy.typing import ArrayLike
 
 from jaxmark.spectral.precision import matmul
 from jaxmark.watermark.blind.scheme import Look
 
-_STARTS, _CLIMBS, _STEPS = 256, 4, 6  # random changes; how many of them are refined, and by how many steps
+_STARTS_PER_CLIMB, _STEPS = 64, 6  # random changes for each that is refined, and the number of steps
+_BATCH = 256  # random changes that are tried at once, to limit the memory
+
+
+def random_changes(count: int, size: int) -> Float64[np.ndarray, "count size"]:
+    """Draw small changes in standard deviations, the same in every call; the first is no change."""
+    changes = np.random.default_rng(0).normal(size=(count, size))
+    changes[0] = 0
+    return changes
+
+
+def reliability(error: ArrayLike, step: ArrayLike, order: int) -> np.ndarray:
+    """Compute the mean cosine exp(-(2πn σ/step)²/2) of n times a phase whose value has an error of this deviation σ."""
+    return np.asarray(np.exp(-((2 * np.pi * order * np.asarray(error) / np.asarray(step)) ** 2) / 2))
 
 
 class Found(NamedTuple):
@@ -28,48 +42,54 @@ class Found(NamedTuple):
 def search(
     values: Float[Array, " anchors"],
     changes: Float[Array, "anchors changes"],
-    good: Float[Array, " anchors"],
+    weights: Float[Array, "steps anchors"],
     offsets: Float[Array, "turns anchors"],
     steps: Float[Array, " steps"],
     spread: Float[Array, " changes"],
+    starts: Float[Array, "starts changes"],
 ) -> Found:
-    """Find the small changes for which values fit the offsets best, modulo half a step: max Σ cos 4π(y/step - δ).
+    """Find the small changes for which values fit the offsets best, modulo half a step: max Σ ω cos 4π(y/step - δ).
 
     Random changes are tried, and the best ones are refined by Gauss-Newton steps.
 
     Args:
         values: the values y of a view.
         changes: derivatives of the values with respect to small changes, see `Look`.
-        good: 1 for each anchor that counts, else 0.
+        weights: ω of each anchor for each step, from 0 for anchors that do not count to 1.
         offsets: δ of each anchor, for each turn.
         steps: quantisation steps of the values.
         spread: standard deviations of the small changes.
+        starts: changes to begin with, in standard deviations, see `random_changes`.
     """
-    starts = jnp.asarray(np.random.default_rng(0).normal(size=(_STARTS, len(spread))), values.dtype).at[0].set(0)
-    scaled = changes * spread
+    scaled, climbs = changes * spread, max(len(starts) // _STARTS_PER_CLIMB, 1)
 
-    def fit(step: Float[Array, ""], offset: Float[Array, " anchors"]) -> tuple[Array, Array]:
-        base, slope = values / step - offset, scaled / step * good[:, None]
+    def fit(step: Float[Array, ""], weight: Float[Array, " anchors"], offset: Float[Array, " anchors"]) -> tuple:
+        # Anchors that do not count may have any values.
+        counts = weight > 0
+        base, slope = jnp.where(counts, values / step - offset, 0), jnp.where(counts[:, None], scaled / step, 0)
 
         def pilot(change: Float[Array, "batch changes"]) -> Float[Array, " batch"]:
-            return jnp.cos(4 * jnp.pi * (base + matmul(change, slope.T))) @ good
+            return jnp.cos(4 * jnp.pi * (base + matmul(change, slope.T))) @ weight
 
         def refine(change: Float[Array, "batch changes"], _: None) -> tuple[Float[Array, "batch changes"], None]:
             phase = base + matmul(change, slope.T)
             residual = phase - jnp.round(2 * phase) / 2
-            weight = good * jnp.maximum(jnp.cos(4 * jnp.pi * residual), 0)
-            gram = jnp.einsum("ac,ta,ad->tcd", slope, weight, slope) + jnp.eye(len(spread), dtype=values.dtype)
-            gradient = jnp.einsum("ac,ta->tc", slope, weight * residual)
+            pull = weight * jnp.maximum(jnp.cos(4 * jnp.pi * residual), 0)
+            gram = jnp.einsum("ac,ta,ad->tcd", slope, pull, slope) + jnp.eye(len(spread), dtype=values.dtype)
+            gradient = jnp.einsum("ac,ta->tc", slope, pull * residual)
             return change - jnp.linalg.solve(gram, gradient[..., None])[..., 0], None
 
-        best = starts[jax.lax.top_k(pilot(starts), _CLIMBS)[1]]
+        batches = starts.reshape(-1, min(_BATCH, len(starts)), starts.shape[1])
+        best = starts[jax.lax.top_k(jax.lax.map(pilot, batches).ravel(), climbs)[1]]
         best = jnp.concatenate([starts[:1], best, jax.lax.scan(refine, best, None, length=_STEPS)[0]])
         # Large changes are unlikely, and some of many changes fit by chance.
-        fit_score = pilot(best) / jnp.sqrt(jnp.maximum(good.sum(), 1) / 2)
+        fit_score = pilot(best) / jnp.sqrt(jnp.maximum(jnp.sum(weight**2), 1) / 2)
         chosen = jnp.argmax(fit_score - jnp.sum(best**2, axis=1) / 8)
         return best[chosen] * spread, fit_score[chosen]
 
-    change, pilot = jax.lax.map(lambda step: jax.vmap(lambda offset: fit(step, offset))(offsets), steps)
+    change, pilot = jax.lax.map(
+        lambda kind: jax.vmap(lambda offset: fit(kind[0], kind[1], offset))(offsets), (steps, weights)
+    )
     return Found(jnp.swapaxes(change, 0, 1), pilot.T)
 
 

@@ -13,9 +13,13 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
+from jaxmark.watermark.blind import reading
 from jaxmark.watermark.blind.anchors import place
-from jaxmark.watermark.blind.hint import Hint
+from jaxmark.watermark.blind.field import FieldScheme
+from jaxmark.watermark.blind.hint import Hint, Posed
 from jaxmark.watermark.blind.landmarks import Border, Landmarks, find_landmarks
+from jaxmark.watermark.blind.scheme import Look
+from jaxmark.watermark.blind.search import moved, reliability
 from jaxmark.watermark.schemes.registry import make_blind_scheme
 from tests.samples import bumpy_sphere
 
@@ -219,3 +223,64 @@ def test_records_with_other_parameters_are_refused(hint: Hint):
         usual = known if name == "field" else {"width": 32.0, "step": 0.5}
         with pytest.raises(jm.JaxmarkError, match="other parameters"):
             make_blind_scheme(name, usual | parameters)
+
+
+@pytest.fixture(scope="module")
+def views(rough: Mesh, hint: Hint) -> tuple[Look, Look]:
+    """Half of the surface, and all of it, in one pose, which is not quite the surface's own."""
+    pose = Posed(Pose(Rotation.from_rotvec([0.01, 0.02, 0]).as_matrix(), np.array([0.003, 0, 0])), False, 0)
+    scheme = FieldScheme(widths=(0.03,), hint=hint.to_text())
+    half, whole = (scheme._in_pose(mesh, pose, (0.0,)) for mesh in (jm.attack(rough, "cropping", 0.5, seed=0), rough))
+    return half[0], whole[0]
+
+
+def values_at(view: Look, values: np.ndarray) -> dict[tuple[int, ...], float]:
+    """The values of the anchors that count, by their cells."""
+    cells = map(tuple, view.names[0][view.good].tolist())
+    return dict(zip(cells, np.asarray(values, np.float64)[view.good].tolist(), strict=True))
+
+
+def test_values_beside_a_border_are_off_by_the_expected_error(views: tuple[Look, Look]):
+    half, whole = views
+    assert not np.any(whole.error)
+    errors, known = values_at(half, np.asarray(half.error)), values_at(whole, np.asarray(whole.values))
+    off = [(errors[cell], abs(value - known[cell])) for cell, value in values_at(half, half.values).items()]
+    error, difference = np.array(off).T
+    far, near = error < 1e-3 * half.width, error > 0.01 * half.width
+    assert min(far.sum(), near.sum()) > 10
+    assert np.quantile(difference[far], 0.9) < 2e-3 * half.width
+    assert 0.2 < np.sqrt(np.mean((difference[near] / error[near]) ** 2)) < 2
+
+
+def test_derivatives_predict_what_is_seen_again(views: tuple[Look, Look]):
+    half, _ = views
+    change = 0.5 * np.array(half.spread) * [1, -1, 1, -1, 1, -1, 1]
+    assert half.again is not None
+    again = half.again(change)
+    assert again is not None
+    before, predicted = values_at(half, half.values), values_at(half, moved(half, change))
+    seen = values_at(again, again.values)
+    pairs = np.array([(seen[cell] - before[cell], predicted[cell] - before[cell]) for cell in before if cell in seen])
+    assert len(pairs) > 50
+    # A surface that was cut into other pieces, and what is not linear, change the values a little, too.
+    assert np.corrcoef(pairs.T)[0, 1] > 0.97
+    assert 0.9 < np.linalg.norm(pairs[:, 0]) / np.linalg.norm(pairs[:, 1]) < 1.1
+
+
+def test_the_reliability_of_a_phase_is_its_mean_cosine():
+    error, step = 0.02, 0.11
+    turns = np.random.default_rng(0).normal(0, error, 200_000) / step
+    for order in (1, 2):
+        assert reliability(error, step, order) == pytest.approx(np.cos(2 * np.pi * order * turns).mean(), abs=0.01)
+
+
+def test_anchors_that_are_not_reliable_do_not_count(views: tuple[Look, Look]):
+    half, _ = views
+    scheme, choices = FieldScheme(steps=(1e-3,)), reading.context(bytes(32), 8, "field")
+    reliable = half.good & (np.arange(len(half.good)) % 2 == 0)
+    weighted = half._replace(error=np.where(reliable, 0.0, np.inf), starts=64)
+    dropped = half._replace(error=0.0, good=reliable, starts=64)
+    for one, other in zip(*(reading._readings(view, scheme, choices, 64) for view in (weighted, dropped)), strict=True):
+        np.testing.assert_allclose(one.soft, other.soft, atol=1e-6)
+        assert (one.square, one.reliable) == pytest.approx((other.square, other.reliable))
+        assert one.pilot == pytest.approx(other.pilot, abs=1e-4)
