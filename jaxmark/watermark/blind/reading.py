@@ -243,9 +243,11 @@ def _readings_again(readings: list[Phases], scheme: BlindScheme, choices: Choice
     """
     found: list[Phases] = []
     for _ in range(LOOKS_AGAIN):
-        best = max((one for one in readings if one.view.again is not None), key=lambda one: one.pilot, default=None)
-        view = None if best is None or best.view.again is None else best.view.again(best.change)
+        best = max(readings, key=lambda one: one.pilot)
+        view = best.view.again(best.change)
         readings = [] if view is None else _readings(view, scheme, choices, length)
+        if not readings:
+            break
         found += readings
     return found
 

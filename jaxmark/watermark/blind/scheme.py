@@ -57,6 +57,10 @@ class AnchoredHost(NamedTuple):
         return len(np.unique(self.names[self.good > 0], axis=0))
 
 
+def _nothing_more(change: Float64[np.ndarray, " changes"]) -> None:
+    """See nothing more after a small change of a view."""
+
+
 class Look(NamedTuple):
     """A view of a suspect: its anchors and their values; independent of the key's signs.
 
@@ -75,8 +79,8 @@ class Look(NamedTuple):
     by_hint: bool = False  # whether the pose was found by the hint of a record
     error: Float64[np.ndarray, " anchors"] | float = 0.0  # standard deviation of values because of a border beside them
     starts: int = STARTS  # number of small changes that are tried
-    #: Sees the suspect again after a small change of the view; None where that is not worth the time.
-    again: "Callable[[Float64[np.ndarray, ' changes']], Look | None] | None" = None
+    #: Sees the suspect again after a small change of the view; returns None if that would show nothing more.
+    again: "Callable[[Float64[np.ndarray, ' changes']], Look | None]" = _nothing_more
 
 
 @runtime_checkable
