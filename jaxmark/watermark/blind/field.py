@@ -222,7 +222,8 @@ class FieldScheme(BlindScheme):
         matrix = (1 + change[6]) * Rotation.from_rotvec(change[:3]).as_matrix()
         motion = Pose(matrix, centre - matrix @ centre + change[3:6])
         changed = posed._replace(pose=posed.pose.then(motion.inverse()))
-        return next(iter(replace(self, widths=(width,))._in_pose(suspect, changed, (blur,), _SMALLER)), None)
+        looks = replace(self, widths=(width,))._in_pose(suspect, changed, (blur,), _SMALLER)
+        return looks[0] if looks else None
 
     def _seen(self, mesh: Mesh, blurs: Sequence[float]) -> Iterator[tuple[float, float, Anchors, Changes]]:
         """Measure the values of a surface for each width and blur.

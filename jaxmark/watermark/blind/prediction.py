@@ -9,6 +9,7 @@ from jaxtyping import Bool, Int64
 from numpy.typing import ArrayLike
 
 from jaxmark.watermark.blind.scheme import Look
+from jaxmark.watermark.blind.search import reliability
 
 _ORDERS, _PLACES = 24, 192  # orders of a wrapped normal's series, and number of angles at which it is evaluated
 _SHARPEST, _TINY = 0.995, 1e-12  # mean cosine of the narrowest distribution, and lower limit on densities
@@ -19,7 +20,7 @@ def mean_cosine(spread: float, step: float, alpha: float) -> float:
 
     The error of a phase is uniform over the rest of the way, plus a Gaussian: ρ = sinc(1 - α) exp(-2 (πσ/step)²).
     """
-    return float(np.sinc(1 - min(alpha, 1.0))) * math.exp(-2 * (math.pi * spread / step) ** 2)
+    return float(np.sinc(1 - min(alpha, 1.0)) * reliability(spread, step))
 
 
 class Margin(NamedTuple):

@@ -216,7 +216,7 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
     fit = search(
         view.values,
         view.changes,
-        jnp.asarray(view.good * reliability(errors, steps[:, None], 2), dtype),
+        jnp.asarray(view.good * reliability(errors, steps[:, None] / 2), dtype),
         jnp.asarray(offsets, dtype),
         jnp.asarray(steps, dtype),
         jnp.asarray(view.spread, dtype),
@@ -225,14 +225,15 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
     changes, pilots = np.asarray(fit.change, np.float64), np.asarray(fit.pilot, np.float64)
     readings = []
     for turn, (dither, group) in enumerate(choices_per_turn):
+        alike = np.bincount(group)  # number of anchors of each name
         for rung, step in enumerate(steps):
-            reliable = reliability(errors[counted], step, 1)
+            reliable = reliability(errors[counted], step)
+            total = float(np.sum(np.bincount(group, reliable) / alike))
             for change, pilot in ((np.zeros(len(view.spread)), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
                 cosines = np.cos(2 * np.pi * (moved(view, change)[counted] / step - offsets[turn, counted]))
-                cosine = np.bincount(group, reliable * cosines) / np.bincount(group)
+                cosine = np.bincount(group, reliable * cosines) / alike
                 soft, square = np.bincount(dither.slot, dither.sign * cosine, length), float(cosine @ cosine)
-                mean = float(np.sum(np.bincount(group, reliable) / np.bincount(group)))
-                readings.append(Phases(view, turn, float(step), change, pilot, soft, square, len(cosine), mean))
+                readings.append(Phases(view, turn, float(step), change, pilot, soft, square, len(cosine), total))
     return readings
 
 

@@ -17,6 +17,9 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.coding.keys import Choices
 
+STARTS = 256  # small changes of a view that are tried, unless the view needs more
+LOOKS_AGAIN = 2  # number of times that a reader sees the suspect again in the likeliest view of a group
+
 
 @runtime_checkable
 class Measured(Protocol):
@@ -33,10 +36,6 @@ def measure(
 ) -> tuple[Float[Array, " anchors"], Float[Array, " held"]]:
     """See `Measured.measure`."""
     return shape.measure(vertices)
-
-
-STARTS = 256  # small changes of a view that are tried, unless the view needs more
-LOOKS_AGAIN = 2  # number of times that a reader sees the suspect again in the likeliest view of a group
 
 
 class AnchoredHost(NamedTuple):

@@ -26,9 +26,9 @@ def random_changes(count: int, size: int) -> Float64[np.ndarray, "count size"]:
     return changes
 
 
-def reliability(error: ArrayLike, step: ArrayLike, order: int) -> np.ndarray:
-    """Compute the mean cosine exp(-(2πn σ/step)²/2) of n times a phase whose value has an error of this deviation σ."""
-    return np.asarray(np.exp(-((2 * np.pi * order * np.asarray(error) / np.asarray(step)) ** 2) / 2))
+def reliability(error: ArrayLike, step: ArrayLike) -> np.ndarray:
+    """Compute the mean cosine exp(-2 (πσ/step)²) of a phase whose value has an error of this standard deviation σ."""
+    return np.asarray(np.exp(-2 * (np.pi * np.asarray(error) / np.asarray(step)) ** 2))
 
 
 class Found(NamedTuple):
@@ -63,10 +63,10 @@ def search(
     """
     scaled, climbs = changes * spread, max(len(starts) // _STARTS_PER_CLIMB, 1)
 
-    def fit(step: Float[Array, ""], weight: Float[Array, " anchors"], offset: Float[Array, " anchors"]) -> tuple:
-        # Anchors that do not count may have any values.
-        counts = weight > 0
-        base, slope = jnp.where(counts, values / step - offset, 0), jnp.where(counts[:, None], scaled / step, 0)
+    def fit(
+        step: Float[Array, ""], weight: Float[Array, " anchors"], offset: Float[Array, " anchors"]
+    ) -> tuple[Array, Array]:
+        base, slope = values / step - offset, scaled / step
 
         def pilot(change: Float[Array, "batch changes"]) -> Float[Array, " batch"]:
             return jnp.cos(4 * jnp.pi * (base + matmul(change, slope.T))) @ weight

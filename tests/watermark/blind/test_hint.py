@@ -270,7 +270,7 @@ def test_the_reliability_of_a_phase_is_its_mean_cosine():
     error, step = 0.02, 0.11
     turns = np.random.default_rng(0).normal(0, error, 200_000) / step
     for order in (1, 2):
-        assert reliability(error, step, order) == pytest.approx(np.cos(2 * np.pi * order * turns).mean(), abs=0.01)
+        assert reliability(error, step / order) == pytest.approx(np.cos(2 * np.pi * order * turns).mean(), abs=0.01)
 
 
 def test_anchors_that_are_not_reliable_do_not_count(views: tuple[Look, Look]):
