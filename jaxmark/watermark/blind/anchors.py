@@ -132,6 +132,9 @@ class Pieces(NamedTuple):
 def cut(mesh: Mesh, width: float) -> Pieces:
     """Cut a surface into pieces much smaller than a Gaussian of this width; deterministic.
 
+    Values at anchors must not depend on the order of vertices and faces, nor on the directions of the axes: on coarse
+    meshes, whose faces are about as wide as the Gaussian, such differences would be as large as a mark.
+
     Raises:
         JaxmarkError: if there are too many pieces.
     """
@@ -141,17 +144,11 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     areas = np.linalg.norm(normals, axis=1) / 2
     nonempty = areas > 0
     faces, normals, areas = faces[nonempty], normals[nonempty], areas[nonempty]
-    _check(float(areas.sum()) / (_PIECE_AREA * width**2), _MAX_SAMPLES)
-    count = np.maximum(np.ceil(areas / (_PIECE_AREA * width**2)), 1).astype(np.int64)
+    sides = np.maximum(np.ceil(np.sqrt(areas / (_PIECE_AREA * width**2))), 1)
+    _check(float(np.sum(sides**2)) - len(sides), _MAX_SAMPLES)
+    count = sides.astype(np.int64) ** 2
     face = np.repeat(np.arange(len(faces)), count)
-    index = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
-    # Multiples of the plastic number's powers cover a triangle evenly (Roberts, "The unreasonable effectiveness of
-    # quasirandom sequences", 2018).
-    u, v = (index * 0.7548776662466927 + 0.5) % 1, (index * 0.5698402909980532 + 0.5) % 1
-    u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
-    single = count[face] == 1
-    u[single] = v[single] = 1 / 3
-    shares = np.stack([1 - u - v, u, v], axis=1)
+    shares = _centres(np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count), np.sqrt(count)[face])
     points = np.einsum("sk,skc->sc", shares, vertices[faces[face]])
     # Pieces do not mix sheets: the normals of each have the same signs in all coordinates.
     cube = np.floor(points / (_PIECE_SIDE * width)).astype(np.int64)
@@ -160,6 +157,20 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     order = np.argsort(piece.ravel(), kind="stable")
     padding = np.zeros(int(piece.max(initial=0)) + 1, bool)
     return Pieces(faces[face][order], shares[order], 1 / count[face][order], piece.ravel()[order], padding)
+
+
+def _centres(
+    index: Int64[np.ndarray, " samples"], sides: Float64[np.ndarray, " samples"]
+) -> Float64[np.ndarray, "samples 3"]:
+    """Compute the barycentric coordinates of the centres of the sides² equal triangles that a triangle is cut into.
+
+    They do not depend on the order of the triangle's corners, and their mean of any linear function is exact. Row k
+    below the first corner has 2k + 1 triangles, every other one upside down.
+    """
+    row = np.floor(np.sqrt(index))
+    pair, upside_down = np.divmod(index - row**2, 2)
+    second, third = pair + (1 + upside_down) / 3, row - pair + (1 - 2 * upside_down) / 3
+    return np.stack([sides - second - third, second, third], axis=1) / sides[:, None]
 
 
 @jax.jit
