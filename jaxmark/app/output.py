@@ -144,8 +144,8 @@ def detection_lines(
         charges: whether to list how much each choice of the reader cost.
     """
     evidence = detection.evidence
-    read = f"message {message_text(detection.message)}" if detection.message is not None else "no message could be read"
-    text = f"{VERDICTS[detection_status(detection, alpha)]}: {read}; "
+    status = detection_status(detection, alpha)
+    text = f"{VERDICTS[status]}: {_content_text(detection, status)}; "
     if evidence.caveats:
         text += (
             f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
@@ -157,7 +157,10 @@ def detection_lines(
         )
         if timestamped is not None:
             text += f", {power(timestamped.log10_p)} if the commitment is older than the suspect"
-    text = " ".join([f"{text} (--alpha {alpha:g})" + "." * bool(detection.notes), *detection.notes])
+    notes = detection.notes
+    if status is Status.NOTHING and detection.message is None and detection.claimed is None:
+        notes += ("A claim needs less evidence: if you know the message, give it by --message.",)
+    text = " ".join([f"{text} (--alpha {alpha:g})" + "." * bool(notes), *notes])
     if charges:
         named = {
             "": timestamped or evidence,
@@ -165,6 +168,15 @@ def detection_lines(
         }
         return text, *(f"charged in log10 p{name}: {_charged(entry)}" for name, entry in named.items())
     return (text,)
+
+
+def _content_text(detection: Detection, status: Status) -> str:
+    """Describe what was read."""
+    if detection.message is not None:
+        return f"message {message_text(detection.message)}"
+    if status is Status.NOTHING or not detection.claimed:
+        return "no message could be read"
+    return f"the claimed message {message_text(detection.claimed)}, which could not be decoded"
 
 
 def _charged(evidence: Evidence) -> str:

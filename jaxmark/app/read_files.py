@@ -198,7 +198,10 @@ class FileReader:
             note = f"Only the {len(names)} largest of {len(readable)} meshes were read; select others by --mesh."
             best = best._replace(notes=(*best.notes, note))
         if record is None and best.message is None:
-            note = "If the suspect is a part, give the record: parts of marks of `field` are read only with its hint."
+            note = (
+                "If the suspect is a part, or has more than the marked mesh, give the record: marks of `field` are then"
+                " read only with its hint."
+            )
             best = best._replace(notes=(*best.notes, note))
         parts = [best_of(found, ledger.PARTS, tries) for found in each.values() if found]
         return self._count_proving(best, parts, len(names)) if several else best

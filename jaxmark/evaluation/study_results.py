@@ -16,6 +16,7 @@ from jaxmark.files.atomic import write_atomically
 from jaxmark.plot.figures import Picture, write_page
 
 _LABELS: dict[Control, str] = {"unmarked": "unmarked, detected", "wrong-key": "another key, detected"}
+_NO_TRIALS = {"detected": 0, "trials": 0}
 # Columns whose unit is not evident; the mark and the attack have lengths in one unit.
 _HEADS = {"budget": "budget, RMS over the diagonal or limits"}
 _LENGTHS = ("mark, RMS over the diagonal", "strength over the diagonal")
@@ -50,7 +51,7 @@ class Results:
     def _table(self) -> tuple[list[str], list[list[str]]]:
         """Return the column heads and the lines of a table of all points."""
         cells: dict[tuple[Any, ...], dict[Control, dict[str, Any]]] = {}
-        for rate in self.rates():
+        for rate in rates.rates(self._counted):
             cells.setdefault(tuple(rate[name] for name in POINT), {})[rate["control"]] = rate
         heads = [*(_HEADS.get(name, name) for name in POINT), *_LENGTHS]
         heads += ["read", "95 %", "wrong bits", "log10 p, median", "without floor", *_LABELS.values()]
@@ -62,15 +63,21 @@ class Results:
             low, high = 100 * mark["read_low"], 100 * mark["read_high"]
             line += [f"{mark['read']}/{mark['trials']}", f"{low:.0f} - {high:.0f}"]
             line += [f"{100 * mark['bit_errors']:.1f} %", f"{mark['log10_p']:.1f}", f"{mark['log10_p_unfloored']:.1f}"]
-            lines.append(line + [f"{rate[name]['detected']}/{rate[name]['trials']}" for name in _LABELS])
+            controls = [rate.get(name, _NO_TRIALS) for name in _LABELS]
+            lines.append(line + [f"{control['detected']}/{control['trials']}" for control in controls])
         return heads, lines
 
+    @property
+    def _counted(self) -> list[Row]:
+        """All rows but those of controls that were not read, which say nothing about false positives."""
+        return [row for row in self.rows if row.control == "marked" or not row.refusal]
+
     def _controls(self) -> list[str]:
-        """Return the total of each control."""
+        """Return the total of each control that was read."""
         return [
             f"{_LABELS[rate['control']]}: {rate['detected']}/{rate['trials']}, "
             f"95 % interval up to {100 * rate['detected_high']:.2g} %"
-            for rate in self.rates(["control"])
+            for rate in rates.rates(self._counted, ["control"])
             if rate["control"] != "marked"
         ]
 

@@ -23,7 +23,7 @@ from jaxmark.geometry.mesh import Mesh, check_faces
 from jaxmark.watermark.arrays import MarkArrays, MarkBatch, make_arrays, make_batch
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
-from jaxmark.watermark.blind.writing import Writer
+from jaxmark.watermark.blind.writing import Writer, remedies
 from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
@@ -292,7 +292,7 @@ class BlindMarker:
     def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`."""
         budget = Budget.of(budget)
-        marked, info = self.write(message, budget)
+        marked, info = self.write(message, budget, to_be_read=read_back)
         if budget.noise is not None and info.survives.whole < budget.noise:
             raise JaxmarkError(
                 f"This mark would survive noise of {info.survives.whole:.2g}, less than {budget.noise:g}; use a larger"
@@ -304,11 +304,17 @@ class BlindMarker:
         return marked, info
 
     def write(
-        self, message: bytes, budget: BudgetLike = None, reference: distortion.Reference | None = None
+        self,
+        message: bytes,
+        budget: BudgetLike = None,
+        reference: distortion.Reference | None = None,
+        *,
+        to_be_read: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
         """Write a message as far as a budget allows; limits are measured against `reference`, if given."""
         choices, bounds = self.writer.choices, Budget.of(budget).bounds_of(self.original)
-        written = self.writer.write(blind_reading.codeword(message, choices), bounds, self.bits, reference)
+        word = blind_reading.codeword(message, choices)
+        written = self.writer.write(word, bounds, self.bits, reference, to_be_read=to_be_read)
         record = Record(
             scheme=self.scheme.name,
             bits=self.bits,
@@ -334,7 +340,7 @@ class BlindMarker:
     def check(self, marked: Mesh, message: bytes) -> None:
         """See `Marker`."""
         if not self.reads(marked, message):
-            raise _does_not_read(self, f"a larger budget, a shorter message or the scheme {DEFAULT_SCHEME!r}")
+            raise _does_not_read(self, remedies(self.bits))
 
     def reads(self, marked: Mesh, message: bytes) -> bool:
         """Whether a message is decoded, or, for a presence mark, its presence is proven."""
@@ -414,7 +420,7 @@ class CombinedMarker:
         for place, scheme in enumerate(self.schemes, 1):
             rms = None if place == len(self.schemes) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
-            marked, blind_info = marker.write(message, Budget(rms=rms, limits=limits), reference)
+            marked, blind_info = marker.write(message, Budget(rms=rms, limits=limits), reference, to_be_read=read_back)
             survives.append(blind_info.survives)
             notes += blind_info.notes
         change = distortion.displacement_size(mesh, marked)

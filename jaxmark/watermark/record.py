@@ -222,7 +222,8 @@ class Record:
         data = {name: value for name, value in data.items() if name != "format"}
         if data.get("version") != SCHEME_VERSION:
             raise JaxmarkError(
-                f"The record {where} is of version {data.get('version')}; this jaxmark reads version {SCHEME_VERSION}."
+                f"The record {where} is of version {data.get('version')!r}; this jaxmark reads version"
+                f" {SCHEME_VERSION}."
             )
         if data.keys() != _FIELDS.keys() or any(type(data[name]) is not kind for name, kind in _FIELDS.items()):
             raise JaxmarkError(f"The record {where} is damaged: its fields are not those of a record.")
@@ -299,7 +300,7 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
     meshes = data.get("meshes")
     if data.get("version") != _SCENE_VERSION:
         raise JaxmarkError(
-            f"The record {path} is of version {data.get('version')}; this jaxmark reads {_SCENE_VERSION}."
+            f"The record {path} is of version {data.get('version')!r}; this jaxmark reads {_SCENE_VERSION}."
         )
     if not isinstance(meshes, dict) or not meshes:
         raise JaxmarkError(f"The record {path} is damaged: it has no meshes.")

@@ -219,6 +219,14 @@ def test_rates_pool_what_is_not_named():
         table.rates(["colour"])
 
 
+def test_controls_that_were_not_read_are_not_counted():
+    rows = [*made_up(2), *made_up(2, control="unmarked", detected=False, refusal="Not attacked: Not this one.")]
+    rows += made_up(3, control="wrong-key", detected=False)
+    text = Results(tuple(rows)).markdown()
+    assert "| 0/0 | 0/3 |" in text
+    assert "unmarked, detected" not in text.split("|")[-1]
+
+
 def test_controls_and_marks_are_never_pooled():
     controls = [row for name in ("unmarked", "wrong-key") for row in made_up(3, control=name, read=False)]
     found = Results((*made_up(3), *controls)).rates(["attack"])

@@ -110,7 +110,7 @@ class Hint:
         except (ValueError, binascii.Error, IndexError):
             raise JaxmarkError("The record is damaged: its hint is incomplete. Use an unedited copy.") from None
         if head["version"] != _VERSION:
-            raise JaxmarkError(f"The record's hint is of version {head['version']}; this jaxmark reads {_VERSION}.")
+            raise JaxmarkError(f"The record's hint is of version {head['version']!r}; this jaxmark reads {_VERSION}.")
         normals, tangents = (unit(points[name].astype(np.float64)) for name in ("normal", "tangent"))
         places = _UNIT * points["place"]
         is_in_range = normals.any(axis=1) & tangents.any(axis=1) & (points["kind"] < 2 * len(_WIDTHS))

@@ -35,7 +35,9 @@ from jaxmark.watermark.record import Record, is_recorded
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, is_builtin
 
 TAG_BITS = 40
+_MOST_BITS = 2**15  # the largest payload
 _CODE_SPREAD = 4  # least number of code bits per bit of message and tag: few anchors then share a code bit
+_MOST_PER_ANCHOR = 32  # largest number of code bits per anchor; more are not read, whatever a record says
 _CHANGES = 2  # changes of pose that are read: none, and the one that fits the offsets best
 _CANDIDATES = 32  # number of candidate messages of each reading whose tags are compared
 # log10 p from which on no other view is tried, with and without a decoded message.
@@ -85,10 +87,12 @@ def code_length(bits: int) -> int:
     """Compute the number of code bits for a payload: the least power of two of at least four times message and tag.
 
     Raises:
-        JaxmarkError: if the payload is not a multiple of 8 bits, or negative.
+        JaxmarkError: if the payload is not a multiple of 8 bits, negative or too large.
     """
     if bits < 0 or bits % 8:
         raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits}.")
+    if bits > _MOST_BITS:
+        raise JaxmarkError(f"A mark that is read without the original has at most {_MOST_BITS} bits, got {bits}.")
     return 1 << math.ceil(math.log2(_CODE_SPREAD * (bits + TAG_BITS))) if bits else 1
 
 
@@ -162,7 +166,10 @@ def _note_on_poses(count: int) -> str:
     if count == 0:
         return "The record's hint gives no pose of this suspect: too few landmarks of the original are found on it."
     tried = "one pose" if count == 1 else f"{count} poses"
-    return f"The record's hint gives {tried} of this suspect, but what is read there does not prove the mark."
+    return (
+        f"The record's hint gives {tried} of this suspect, but what is read there does not prove the mark. If the"
+        " record may be of another mesh, read without it."
+    )
 
 
 def try_each(reads: Iterable[Callable[[], Detection]]) -> Iterator[Detection]:
@@ -198,12 +205,12 @@ def is_sure(found: Detection) -> bool:
 
 
 def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) -> list[Phases]:
-    """Read a view in all ways.
+    """Read a view in all ways; in none if its anchors are far too few for the payload.
 
     Anchors of one name have one sign, so that the mean of their cosines is one term of the score.
     """
     counted = np.flatnonzero(view.good)
-    if not len(counted):
+    if length > _MOST_PER_ANCHOR * len(counted):
         return []
     dtype, steps = view.values.dtype, np.asarray(scheme.steps)
     errors = np.broadcast_to(view.error, view.good.shape)
@@ -267,7 +274,11 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
     readings = sorted(readings, key=lambda reading: -reading.pilot)
     soft = np.stack([reading.soft for reading in readings])
     choices, bits, claimed, record = claim
-    decoded = None if claimed == b"" else decode_any(soft, bits, choices, TAG_BITS, _CANDIDATES)
+    decoded = None
+    if claimed != b"":
+        # An anchor carries at most one bit of information.
+        is_enough = np.array([[reading.anchors >= bits + TAG_BITS] for reading in readings])
+        decoded = decode_any(soft * is_enough, bits, choices, TAG_BITS, _CANDIDATES)
     recorded = record is not None and bool(record.message_commitment)
     message = claimed
     if decoded is not None and decoded.message != claimed:

@@ -102,6 +102,7 @@ class Plan(NamedTuple):
     size: float  # RMS of the displacement, in diagonals
     host: AnchoredHost
     dither: Dither
+    note: str  # see `jaxmark.watermark.perception.budget.Written`
 
     def margin(self, spread: float, bits: int) -> Margin:
         """Compute the margin of information after an attack that changes values by `spread` (root mean square)."""
@@ -121,7 +122,8 @@ class Allowance(NamedTuple):
     def plan(self, step: float) -> Plan:
         """Plan a mark with a quantisation step, with the largest α that is allowed."""
         alpha = min(self.allowed / step, 1.0)
-        return Plan(self.width, step, alpha, self.size * alpha * step / self.allowed, self.host, self.dither)
+        size = self.size * alpha * step / self.allowed
+        return Plan(self.width, step, alpha, size, self.host, self.dither, self.note)
 
 
 class Written(NamedTuple):
@@ -136,6 +138,12 @@ class Written(NamedTuple):
 def carried(bits: int) -> float:
     """Compute the information in bits that values must carry: payload and tag times the code's gap; 1 for presence."""
     return _CODE_GAP * (bits + TAG_BITS) if bits else 1.0
+
+
+def remedies(bits: int) -> str:
+    """List what can be done about a mesh that cannot carry a payload."""
+    shorter = ", a shorter message, a presence mark" if bits else ""
+    return f"a larger budget{shorter} or the scheme 'keyed'"
 
 
 def sureness(plan: Plan, bits: int) -> float:
@@ -209,12 +217,43 @@ class Writer:
             raise JaxmarkError(" ".join((refusal, *notes[:1])))
         return max(fitting, key=lambda plan: (sureness(plan, bits), plan.margin(self._spread(plan.host), bits).surplus))
 
+    def _check_anchors(self, bits: int) -> None:
+        """Check that the mesh has enough anchors for a payload.
+
+        Raises:
+            JaxmarkError: if it has not.
+        """
+        most = max(host.size for host in self.hosts.values())
+        if bits and most < bits + TAG_BITS:
+            raise JaxmarkError(
+                f"This mesh has at most {most} anchors for the scheme {self.scheme.name!r}, and each carries at most"
+                f" one bit: too few for a message of {bits} bits and its tag of {TAG_BITS}. Use {remedies(bits)}."
+            )
+
+    def _check_plan(self, plan: Plan, bits: int) -> None:
+        """Check that a payload can be read, at least from the marked mesh itself.
+
+        Raises:
+            JaxmarkError: if it certainly cannot.
+        """
+        left = plan.margin(0.0, bits)
+        if left.sure < -_SURE:
+            held, needed = max(left.surplus / math.log(2) + carried(bits), 0.0), carried(bits)
+            payload = f"a message of {bits} bits with its tag" if bits else "a presence mark"
+            refusal = (
+                f"Within the budget, the {plan.host.size} anchors of this mesh hold about {held:.0f} bits with the"
+                f" scheme {self.scheme.name!r}, but {payload} needs about {needed:.0f}. Use {remedies(bits)}."
+            )
+            raise JaxmarkError(f"{refusal} {plan.note}".strip())
+
     def write(
         self,
         word: Float64[np.ndarray, " code"],
         bounds: Bounds,
         bits: int,
         reference: distortion.Reference | None = None,
+        *,
+        to_be_read: bool = True,
     ) -> Written:
         """Write a codeword as far as a budget allows.
 
@@ -223,12 +262,17 @@ class Writer:
             bounds: the bounds on the distortion.
             bits: size of the payload in bits.
             reference: the mesh that limits are measured against; by default the original.
+            to_be_read: whether to refuse payloads that cannot be read, before they are written.
 
         Raises:
             JaxmarkError: see `plan`.
         """
+        if to_be_read:
+            self._check_anchors(bits)
         reference = reference or reference_of(self.original)
         plan = self.plan(word, bounds, reference, bits)
+        if to_be_read:
+            self._check_plan(plan, bits)
         targets = plan.host.values - plan.alpha * plan.step * self.off(plan.host, plan.dither, word, plan.step)
         shift = self.shift(plan.host, targets, _ROUNDS)
         written = displace_within(self.original, shift, bounds, reference, first=plan.size)

@@ -20,7 +20,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.surfaces import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark import EmbedInfo, FieldScheme
-from jaxmark.watermark.blind import reading
+from jaxmark.watermark.blind import field, reading, writing
 from jaxmark.watermark.blind.anchors import look, place, see
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.field import TURNS, unsmoothed
@@ -314,6 +314,37 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
     record = dataclasses.replace(marked[1].record, parameters={"width": 0.025, "step": 1e9}).sealed(key)
     with pytest.raises(jm.JaxmarkError, match="no scheme 'field' has its width"):
         jm.detect(shape, key=key, record=record)
+
+
+def test_payloads_that_a_mesh_cannot_hold_are_refused_before_they_are_written(shape: Mesh, key: jm.Key, monkeypatch):
+    anchors = make_blind_marker(shape, key, scheme=SCHEME).writer.hosts[WIDTH].size
+    monkeypatch.setattr(Writer, "off", None)  # nothing is planned
+    with pytest.raises(jm.JaxmarkError, match=f"at most {anchors} anchors .* too few for a message of 160 bits"):
+        jm.embed(shape, bytes(20), key, scheme=SCHEME)
+    monkeypatch.undo()
+    largest = (anchors - reading.TAG_BITS) // 8
+    monkeypatch.setattr(writing, "_ROUNDS", None)  # nothing is written
+    with pytest.raises(jm.JaxmarkError, match=rf"{anchors} anchors of this mesh hold about \d+ bits .* needs about"):
+        jm.embed(shape, bytes(largest), key, budget=6e-4, scheme=SCHEME)
+
+
+def test_a_record_does_not_decide_what_reading_costs(marked, key: jm.Key, monkeypatch):
+    """Its owner can seal any payload; messages that the anchors cannot hold are not decoded."""
+    rows: list[np.ndarray] = []
+
+    def decode_any(soft: np.ndarray, *_: object) -> None:
+        rows.append(soft)
+
+    monkeypatch.setattr(reading, "decode_any", decode_any)
+    monkeypatch.setattr(field, "_UNDONE_STEPS", (0,))
+    suspect = reading.register(marked[0])
+    for bits, decoded in ((32, True), (256, False), (2**15, False)):
+        rows.clear()
+        assert reading.read(suspect, key, bits, SCHEME).log10_p == 0
+        assert any(soft.any() for soft in rows) == decoded
+        assert sum(soft.nbytes for soft in rows) < 2**26
+    with pytest.raises(jm.JaxmarkError, match="at most 32768 bits, got 65536"):
+        jm.detect(marked[0], key=key, record=dataclasses.replace(marked[1].record, bits=2**16).sealed(key))
 
 
 @pytest.mark.long
