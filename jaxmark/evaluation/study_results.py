@@ -76,7 +76,7 @@ class Results:
         """Return the total of each control that was read."""
         return [
             f"{_LABELS[rate['control']]}: {rate['detected']}/{rate['trials']}, "
-            f"95 % interval up to {100 * rate['detected_high']:.2g} %"
+            f"95 % interval up to {100 * rate['detected_high']:.3g} %"
             for rate in rates.rates(self._counted, ["control"])
             if rate["control"] != "marked"
         ]
