@@ -7,6 +7,7 @@ reveals the places, normals and tangents of up to 100 points of the original, an
 
 import base64
 import binascii
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -31,8 +32,11 @@ _FARTHEST = 1.5  # largest coordinate of a landmark in the pose, in which a shap
 _HEAD = np.dtype([("version", "u1"), ("scale", "<f8")])
 _POINT = np.dtype([("place", "<i2", 3), ("normal", "i1", 3), ("tangent", "i1", 3), ("kind", "u1")])
 _LARGEST, _SMALLEST = 1.15, 0.28  # diagonals of parts, in units of the pose
+_METRES = (1.0, 0.01, 0.001, 0.0254)  # usual units: metre, centimetre, millimetre, inch
 _LARGEST_SCENE = 2.0  # the same for a part in the unit of the original, with other things beside it
-_POSES = 4  # poses of a suspect that are read, in the unit of the original and in any unit
+#: Factors between usual units, those near 1 first.
+_UNITS = tuple(sorted({of / by for of in _METRES for by in _METRES}, key=lambda factor: abs(math.log(factor))))
+_POSES = 4  # poses of a suspect that are read, in a usual unit and in any unit
 GROUPS, MOST_POSES = 2, 2 * _POSES  # the largest numbers of groups, and of poses, of `Hint.poses`
 _NEAR = 0.035  # distance of landmarks, in units of the pose, up to which a rough pose fits them
 _CLOSER = (0.035, 0.02, 0.01, 0.006, 0.006)  # the same while the pose is refined
@@ -110,7 +114,7 @@ class Hint:
         except (ValueError, binascii.Error, IndexError):
             raise JaxmarkError("The record is damaged: its hint is incomplete. Use an unedited copy.") from None
         if head["version"] != _VERSION:
-            raise JaxmarkError(f"The record's hint is of version {head['version']!r}; this jaxmark reads {_VERSION}.")
+            raise JaxmarkError(f"The record's hint is of version {head['version']}; this jaxmark reads {_VERSION}.")
         normals, tangents = (unit(points[name].astype(np.float64)) for name in ("normal", "tangent"))
         places = _UNIT * points["place"]
         is_in_range = normals.any(axis=1) & tangents.any(axis=1) & (points["kind"] < 2 * len(_WIDTHS))
@@ -123,7 +127,8 @@ class Hint:
     def poses(self, suspect: Mesh) -> Iterator[list[Posed]]:
         """Iterate over the likeliest poses of a suspect, the likeliest first.
 
-        Poses in the unit of the original come first, and then, unless many landmarks fit one of them, in any unit.
+        Poses in the unit of the original, or in another usual one, come first, and then, unless many landmarks fit one
+        of them, in any unit: a scale that is not exact fits fewer landmarks.
 
         Raises:
             JaxmarkError: if the suspect has no extent.
@@ -131,11 +136,18 @@ class Hint:
         size = diagonal(suspect)
         if not len(self.landmarks.places):
             return
-        if _SMALLEST <= size * self.scale <= _LARGEST_SCENE:
-            found = self._in_scales(suspect, [self.scale])
-            yield found
+        largest = {factor: _LARGEST_SCENE if factor == 1 else _LARGEST for factor in _UNITS}
+        usual = [factor for factor in _UNITS if _SMALLEST <= factor * size * self.scale <= largest[factor]]
+        found: list[Posed] = []
+        for factor in usual:
+            found += self._in_scales(suspect, [factor * self.scale])
+            found = _distinct(sorted(found, key=lambda one: -one.fitting), suspect)[:_POSES]
             if found and found[0].fitting >= _ENOUGH:
-                return
+                break
+        if usual:
+            yield found
+        if found and found[0].fitting >= _ENOUGH:
+            return
         count = int(np.floor(np.log(_LARGEST / _SMALLEST) / np.log(_RATIO))) + 1
         yield self._in_scales(suspect, [_LARGEST / size / _RATIO**index for index in range(count)])
 

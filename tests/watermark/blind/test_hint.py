@@ -151,7 +151,8 @@ def test_damaged_hints_are_refused(hint: Hint, change, reason: str):
 
 
 @pytest.mark.parametrize(
-    ("scale", "mirrored", "inside_out"), [(1.0, False, True), pytest.param(2.9, True, False, marks=pytest.mark.slow)]
+    ("scale", "mirrored", "inside_out"),
+    [(1.0, False, True), (25.4, True, True), pytest.param(2.9, True, False, marks=pytest.mark.slow)],
 )
 def test_the_pose_of_a_part_is_found(rough: Mesh, hint: Hint, scale: float, mirrored: bool, inside_out: bool):
     part = jm.attack(rough, "cropping", 0.3, seed=0)
@@ -159,7 +160,7 @@ def test_the_pose_of_a_part_is_found(rough: Mesh, hint: Hint, scale: float, mirr
     moved = Pose(matrix, np.array([1.0, 2, 3]))
     faces = np.asarray(part.faces)
     suspect = Mesh(moved(np.asarray(part.vertices)), faces[:, ::-1] if inside_out else faces)
-    *_, group = islice(Hint.from_text(hint.to_text()).poses(suspect), 1 if scale == 1 else 2)
+    *_, group = islice(Hint.from_text(hint.to_text()).poses(suspect), 2 if scale == 2.9 else 1)
     best = group[0]
     np.testing.assert_allclose(best.apply(suspect).vertices, np.asarray(part.vertices), atol=0.004)
     np.testing.assert_array_equal(best.apply(suspect).faces, part.faces)
