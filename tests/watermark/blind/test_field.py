@@ -470,8 +470,8 @@ def test_a_limit_that_a_few_faces_make_tight_is_named(thin):
     faces = {int(part.split()[0]) for part in note.split("others: ")[1].split(", ")}
     assert {0, 2} <= faces
     # A limit that allows no mark at all is named in the refusal.
-    with pytest.raises(jm.JaxmarkError, match=r"nothing to write in.*The limit of dame, 0\.003, allows only .* \(by "):
-        thin.write(b"", jm.Budget(limits={"dame": 0.003}))
+    with pytest.raises(jm.JaxmarkError, match=r"nothing to write in.*The limit of dame, 0\.001, allows only .* \(by "):
+        thin.write(b"", jm.Budget(limits={"dame": 0.001}))
 
 
 def test_a_mark_that_does_not_read_back_is_refused_with_the_limit(thin, monkeypatch):
