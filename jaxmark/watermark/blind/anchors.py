@@ -148,7 +148,7 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     _check(float(np.sum(sides**2)) - len(sides), _MAX_SAMPLES)
     count = sides.astype(np.int64) ** 2
     face = np.repeat(np.arange(len(faces)), count)
-    shares = _centres(np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count), np.sqrt(count)[face])
+    shares = _centres(np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count), sides[face])
     points = np.einsum("sk,skc->sc", shares, vertices[faces[face]])
     # Pieces do not mix sheets: the normals of each have the same signs in all coordinates.
     cube = np.floor(points / (_PIECE_SIDE * width)).astype(np.int64)

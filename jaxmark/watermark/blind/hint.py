@@ -32,8 +32,8 @@ _FARTHEST = 1.5  # largest coordinate of a landmark in the pose, in which a shap
 _HEAD = np.dtype([("version", "u1"), ("scale", "<f8")])
 _POINT = np.dtype([("place", "<i2", 3), ("normal", "i1", 3), ("tangent", "i1", 3), ("kind", "u1")])
 _LARGEST, _SMALLEST = 1.15, 0.28  # diagonals of parts, in units of the pose
-_METRES = (1.0, 0.01, 0.001, 0.0254)  # usual units: metre, centimetre, millimetre, inch
 _LARGEST_SCENE = 2.0  # the same for a part in the unit of the original, with other things beside it
+_METRES = (1.0, 0.01, 0.001, 0.0254)  # usual units: metre, centimetre, millimetre, inch
 #: Factors between usual units, those near 1 first.
 _UNITS = tuple(sorted({of / by for of in _METRES for by in _METRES}, key=lambda factor: abs(math.log(factor))))
 _POSES = 4  # poses of a suspect that are read, in a usual unit and in any unit
