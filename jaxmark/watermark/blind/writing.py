@@ -227,7 +227,8 @@ class Writer:
         if bits and most < bits + TAG_BITS:
             raise JaxmarkError(
                 f"This mesh has at most {most} anchors for the scheme {self.scheme.name!r}, and each carries at most"
-                f" one bit: too few for a message of {bits} bits and its tag of {TAG_BITS}. Use {remedies(bits)}."
+                f" one bit: too few for a message of {bits} bits and its tag of {TAG_BITS}. Use a shorter message, a"
+                " presence mark or the scheme 'keyed'."
             )
 
     def _check_plan(self, plan: Plan, bits: int) -> None:
