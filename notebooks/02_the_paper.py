@@ -199,7 +199,7 @@ key = jm.Key(bytes(range(32)))
 markers, marks = {}, {}
 for name, (scheme, detector) in schemes.items():
     markers[name] = jm.make_marker(mesh, key, bits=16, scheme=scheme, detector=detector)
-    marks[name], info = markers[name].embed(MESSAGE, 8e-4, read_back=False)
+    marks[name], info = markers[name].embed(MESSAGE, 8e-4, read_back="never")
     read = markers[name].detect(marks[name]).message == MESSAGE
     print(f"{name:<13} RMS {info.rms:.3%}, largest {info.max:.3%}; reads unattacked: {read}")
     assert read or name == "as printed"

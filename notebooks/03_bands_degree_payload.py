@@ -173,7 +173,7 @@ curves = {}
 for size in (2, 16):
     one = jm.make_marker(mesh, jm.Key(bytes(32)), bits=8 * size)
     message = bytes(range(size))
-    mesh_with, _ = one.embed(message, jm.Budget(rms=4e-4, noise=0), read_back=False)
+    mesh_with, _ = one.embed(message, jm.Budget(rms=4e-4, noise=0), read_back="never")
     curves[f"{8 * size} bits"] = jm.robustness(one, mesh_with, message, "noise", [0.004, 0.012], samples=2)
     print(f"{8 * size} bits:", curves[f"{8 * size} bits"].success.mean(axis=1))
 pictures.success(curves, jm.adversaries.ATTACKS["noise"].unit).save("03_5.png")

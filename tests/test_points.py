@@ -234,7 +234,7 @@ def test_another_sampling_shows_how_high_its_surface_is():
 def test_a_cloud_that_was_sampled_anew_is_read_by_its_planes(
     turn: bool, host: Mesh, marker: jm.watermark.NonBlindMarker
 ):
-    shown = np.asarray(marker.embed(MESSAGE, jm.Budget(rms=1e-3, noise=0), read_back=False)[0].vertices)
+    shown = np.asarray(marker.embed(MESSAGE, jm.Budget(rms=1e-3, noise=0), read_back="never")[0].vertices)
     # The mark at other points of the surface: the mean of what the nearest points show.
     other = ball(12000, 5)
     distance, nearest = KDTree(np.asarray(host.vertices)).query(other, 4)

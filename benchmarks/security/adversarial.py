@@ -66,7 +66,7 @@ def visible(target: Target, scheme: str, steps: int) -> jm.attacks.Attack:
 def colluders(rule: enemies.Rule, count: int, target: Target, scheme: str, steps: int) -> jm.attacks.Attack:
     marker, _, theory = target
     messages = [bytes(np.random.default_rng(seed).bytes(BITS // 8)) for seed in range(1, count)]
-    others = [marker.embed(message, jm.Budget(rms=BUDGET, noise=0), read_back=False)[0] for message in messages]
+    others = [marker.embed(message, jm.Budget(rms=BUDGET, noise=0), read_back="never")[0] for message in messages]
     return around(enemies.collude(others, rule), theory / count)
 
 

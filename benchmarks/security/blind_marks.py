@@ -332,7 +332,7 @@ def versions(work: Marked, count: int) -> Iterator[Seen]:
         message = np.random.default_rng(number).bytes(len(MESSAGE))
         scheme = SCHEME.fixed(work.width, work.step)
         marker = make_blind_marker(version(work.mesh, number + 1), KEY, bits=8 * len(message), scheme=scheme)
-        marked, info = marker.embed(message, work.info.rms, read_back=False)
+        marked, info = marker.embed(message, work.info.rms, read_back="never")
         say(f"version {number}: alpha {info.record.beta:.2f}")
         yield look(marked, work.width, work.step)
 

@@ -38,7 +38,7 @@ def chain(mesh: jm.Mesh, suspect: jm.Mesh | None) -> tuple[Stages, jm.Mesh]:
     marker = jm.make_marker(mesh, KEY, bits=8 * len(MESSAGE))
     reader: Any = marker.reader  # of a keyed carrier
     operator, signal = marker.original.operator, marker.original.signal
-    marked, _ = marker.embed(MESSAGE, jm.Budget(rms=BUDGET, noise=0), read_back=False)
+    marked, _ = marker.embed(MESSAGE, jm.Budget(rms=BUDGET, noise=0), read_back="never")
     suspect = jm.attack(marked, "noise", NOISE, seed=0) if suspect is None else suspect
     family = scaling(BANDS, damping="jackson")
     components = band_components(operator, family, signal)

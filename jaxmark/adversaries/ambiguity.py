@@ -39,7 +39,7 @@ def forge_original(
     forger's; they, `budget`, `scheme` and errors are those of `embed`.
     """
     marker = make_marker(given, key, bits=8 * len(message), scheme=scheme)
-    marked = marker.embed(message, budget, read_back=False)[0]
+    marked = marker.embed(message, budget, read_back="never")[0]
     return Mesh(2 * np.asarray(given.vertices, np.float64) - np.asarray(marked.vertices), marked.faces)
 
 

@@ -112,7 +112,7 @@ def mark_file(
     if message is not None:
         marker = prepare(mesh, key, 8 * len(message), scheme, adapt_to=budget)
         doing(f"embedding {original}")
-        result, info = marker.embed(message, budget, read_back=False)
+        result, info = marker.embed(message, budget, read_back="later")
         marker = marker.with_record(info.record)
         prepared, payload = marker.original, payload_text(info.record.bits)
         read_back = partial(marker.measure_survival, message=message, predicted=info.survives)

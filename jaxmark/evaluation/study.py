@@ -297,7 +297,7 @@ def _mark(point: _Point, seed: int) -> tuple[Mesh | str, float]:
     budget = replace(point.budget, noise=0.0 if point.budget.noise is None else point.budget.noise)
     message = _derive(seed, "message", point.bits // 8)
     try:
-        mesh, info = _marker(point, point.key(seed)).embed(message, budget, read_back=False)
+        mesh, info = _marker(point, point.key(seed)).embed(message, budget, read_back="never")
     except JaxmarkError as error:
         return f"Not marked: {error}", 0.0
     return mesh, info.rms

@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -47,6 +47,8 @@ from jaxmark.watermark.schemes.registry import (
     split,
 )
 
+ReadBack = Literal["now", "later", "never"]  # when a marked mesh is verified
+
 _MAX_TRIED_NOISE = 0.05  # larger noise, which destroys the shape, is not tried
 _SHARES_OF_NOISE = (1.0, 0.7, 0.5, 0.3, 0.1)  # shares of the predicted noise to try; blind marks omit the last
 _LEAST_SHARE, _MOST_SHARE = 0.3, 0.9  # limits on the share of the budget for a mark that is not the last
@@ -61,10 +63,13 @@ class Marker(Protocol):
         """The mesh to mark."""
         ...
 
-    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+    def embed(
+        self, message: bytes, budget: BudgetLike = None, *, read_back: ReadBack = "now"
+    ) -> tuple[Mesh, EmbedInfo]:
         """Embed a message of exactly the payload's size in the original; see `jaxmark.watermark.everyday.embed`.
 
-        Pass `read_back=False` if you verify the written file yourself.
+        Pass `read_back="later"` if you verify the written file yourself, or `"never"` if it need not be readable: then
+        payloads that certainly cannot be read are written, too.
         """
         ...
 
@@ -115,7 +120,9 @@ class Marker(Protocol):
 class NonBlindMarker(Mark):
     """A `Marker` whose marks are read with the original; make one with `make_marker`."""
 
-    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+    def embed(
+        self, message: bytes, budget: BudgetLike = None, *, read_back: ReadBack = "now"
+    ) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`."""
         check_size(message, self.bits)
         budget = Budget.of(budget)
@@ -127,7 +134,7 @@ class NonBlindMarker(Mark):
             self._check_capacity(reached, Conditions(bounds, budget.noise, COVERAGE))
         conditions = (Conditions(bounds, 1.0, share) for share in (1.0, COVERAGE))
         info = info._replace(survives=Survival(*(self.capacity.noise(self.bits, reached, case) for case in conditions)))
-        if read_back:
+        if read_back == "now":
             with info.explained():
                 self.check(marked, message)
         return marked, info
@@ -289,16 +296,18 @@ class BlindMarker:
         choices = blind_reading.context(key, bits, scheme.name)
         return cls(original, key, bits, scheme, Writer(original, scheme, choices))
 
-    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+    def embed(
+        self, message: bytes, budget: BudgetLike = None, *, read_back: ReadBack = "now"
+    ) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`."""
         budget = Budget.of(budget)
-        marked, info = self.write(message, budget, to_be_read=read_back)
+        marked, info = self.write(message, budget, to_be_read=read_back != "never")
         if budget.noise is not None and info.survives.whole < budget.noise:
             raise JaxmarkError(
                 f"This mark would survive noise of {info.survives.whole:.2g}, less than {budget.noise:g}; use a larger"
                 " budget, a shorter message or another scheme."
             )
-        if read_back:
+        if read_back == "now":
             with info.explained():
                 self.with_record(info.record).check(marked, message)
         return marked, info
@@ -398,13 +407,15 @@ class CombinedMarker:
         """See `Marker`."""
         return self.nonblind.original
 
-    def embed(self, message: bytes, budget: BudgetLike = None, *, read_back: bool = True) -> tuple[Mesh, EmbedInfo]:
+    def embed(
+        self, message: bytes, budget: BudgetLike = None, *, read_back: ReadBack = "now"
+    ) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`; the record is that of the non-blind mark."""
         budget = Budget.of(budget)
         mesh = self.original.mesh
         bounds = budget.bounds_of(self.original)
         reference = reference_of(self.original)
-        _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back=False)
+        _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back="never")
         sizes, survived = [alone.rms], [alone.survives.whole]
         for marker in self._blind:
             plan = marker.writer.plan(
@@ -414,19 +425,21 @@ class CombinedMarker:
             survived.append(marker.writer.survives(plan, marker.bits).whole)
         shares = _share(survived)
         first = Budget(rms=shares[0] * sizes[0], noise=budget.noise)
-        marked, info = self.nonblind.embed(message, first, read_back=False)
+        marked, info = self.nonblind.embed(message, first, read_back="never")
         survives, notes = [info.survives], [*alone.notes]
         limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
         for place, scheme in enumerate(self.schemes, 1):
             rms = None if place == len(self.schemes) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
-            marked, blind_info = marker.write(message, Budget(rms=rms, limits=limits), reference, to_be_read=read_back)
+            marked, blind_info = marker.write(
+                message, Budget(rms=rms, limits=limits), reference, to_be_read=read_back != "never"
+            )
             survives.append(blind_info.survives)
             notes += blind_info.notes
         change = distortion.displacement_size(mesh, marked)
         least = Survival(min(survival.whole for survival in survives), max(survival.half for survival in survives))
         info = info._replace(rms=change.rms, max=change.max, survives=least, notes=tuple(notes[:1]))
-        if read_back:
+        if read_back == "now":
             with info.explained():
                 self.check(marked, message)
         return marked, info

@@ -67,7 +67,7 @@ def test_going_round_does_not_help(published):
     for _ in range(4):
         mark = (
             jm.make_marker(last, FORGER, bits=16)
-            .embed(FORGED, jm.Budget(rms=8e-4, noise=0), read_back=False)[0]
+            .embed(FORGED, jm.Budget(rms=8e-4, noise=0), read_back="never")[0]
             .vertices
         )
         last = Mesh(mesh.vertices - (mark - last.vertices), mesh.faces)

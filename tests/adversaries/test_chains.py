@@ -60,7 +60,7 @@ def test_a_chain_as_an_attack_grows_in_all_its_steps(sphere: Mesh):
 @pytest.mark.slow
 def test_costs_are_distortions_over_the_mark_and_more_where_it_is_still_proven(sphere: Mesh, key):
     marker = jm.make_marker(sphere, key, bits=8)
-    marked, _ = marker.embed(b"m", jm.Budget(rms=2e-3, noise=0), read_back=False)
+    marked, _ = marker.embed(b"m", jm.Budget(rms=2e-3, noise=0), read_back="never")
     judge = projected_cost([(marker, marked, b"m")], "rms")
     steps = [("noise", 0.002)]
     suspect = run_chain(marked, steps, seed=0)

@@ -20,7 +20,7 @@ def marker(key: jm.Key) -> jm.watermark.NonBlindMarker:
 @pytest.fixture(scope="module")
 def copies(marker: jm.watermark.NonBlindMarker) -> dict[bytes, Mesh]:
     messages = [b"ok", b"no", b"so", b"we", b"it", b"he"]
-    return {one: marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back=False)[0] for one in messages}
+    return {one: marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back="never")[0] for one in messages}
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_enough_copies_give_the_original_back(key: jm.Key):
     """Marks of one key lie in a space of as many dimensions as the code has bits: more copies span it."""
     marker = jm.make_marker(bumpy_sphere(2), key, bits=16)
     messages = [bytes(one) for one in np.random.default_rng(0).integers(0, 256, (marker.code_bits + 20, 2), np.uint8)]
-    copies = [marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back=False)[0] for one in messages]
+    copies = [marker.embed(one, jm.Budget(rms=8e-4, noise=0), read_back="never")[0] for one in messages]
     original = marker.original.mesh.vertices
 
     def left(rule: Rule, count: int) -> float:

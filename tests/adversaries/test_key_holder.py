@@ -47,7 +47,7 @@ def test_the_size_is_met_and_evidence_falls(marked):
 @pytest.mark.slow
 def test_slopes_agree_with_finite_differences(key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8)
-    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back=False)[0]
+    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back="never")[0]
     seen = marker.observe(marker.register(jm.attack(mesh, "noise", 1e-3, seed=0)))
     code = jnp.asarray(marker.codeword(b"k"))
     value, slope = _slope(marker.reader, seen, code)
@@ -68,7 +68,7 @@ def test_copies_of_a_point_move_together(key: jm.Key):
         np.asarray(points.vertices)[np.asarray(points.faces).ravel()], np.arange(points.faces.size).reshape(-1, 3)
     )
     marker = jm.make_marker(copied, key, bits=8)
-    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back=False)[0]
+    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back="never")[0]
     suspect = jm.attack(mesh, erasure(marker, b"k"), 1e-3, seed=0)
     assert jm.distortion.displacement_size(mesh, suspect).rms == pytest.approx(1e-3, rel=5e-3)
 

@@ -44,7 +44,7 @@ def test_an_attacker_sees_on_average_what_the_owner_sees(marked):
 @pytest.mark.parametrize("scheme", [pytest.param("keyed", marks=pytest.mark.slow), "host"])
 def test_gradients_agree_with_finite_differences(scheme, key: jm.Key, x64):
     marker = jm.make_marker(bumpy_sphere(2), key, bits=8, scheme=scheme)
-    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back=False)[0]
+    mesh = marker.embed(b"k", jm.Budget(rms=5e-3, noise=0), read_back="never")[0]
     surrogate, _ = make_surrogate(mesh, scheme, 8, 5e-3)
     random = np.random.default_rng(0)
     place, way = (

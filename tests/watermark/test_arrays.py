@@ -23,7 +23,7 @@ def marker(request, key: jm.Key) -> NonBlindMarker:
 
 def test_arrays_embed_and_prove_what_meshes_do(marker: NonBlindMarker):
     arrays = marker.arrays(b"ok")
-    marked, _ = marker.embed(b"ok", jm.Budget(rms=8e-4, noise=0), read_back=False)
+    marked, _ = marker.embed(b"ok", jm.Budget(rms=8e-4, noise=0), read_back="never")
     by_arrays = jax.jit(lambda arrays: arrays.embed(8e-4))(arrays)
     np.testing.assert_allclose(marker.to_mesh(by_arrays).vertices, marked.vertices, atol=2e-6)
     noise = 1e-3 * jax.random.normal(jax.random.key(0), arrays.x.shape)

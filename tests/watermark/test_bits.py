@@ -140,7 +140,7 @@ def test_evidence_is_what_a_detection_says(scheme, noise, x64):
     The arrays are padded, from 642 points to 1,024 rows, which must not count as points that were seen.
     """
     marker = jm.make_marker(bumpy_sphere(3), jm.Key(bytes(32)), bits=16, scheme=scheme)
-    marked, _ = marker.embed(b"ok", jm.Budget(rms=4e-4, noise=0), read_back=False)
+    marked, _ = marker.embed(b"ok", jm.Budget(rms=4e-4, noise=0), read_back="never")
     suspect = jm.attack(marked, "noise", noise, seed=0)
     original = marker.original
     moved = (np.asarray(suspect.vertices) - original.mesh.vertices)[original.weld.first] / original.diagonal

@@ -78,7 +78,7 @@ def test_precisions_read_each_other(sphere: Mesh, key: jm.Key, scheme):
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
     marker = jm.make_marker(sphere, key, bits=64, scheme=scheme)
-    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back="never")
     assert marker.reads(marked, MESSAGE)
     assert not marker.reads(marked, b"somebody")
     assert not marker.reads(sphere, MESSAGE)
@@ -88,14 +88,14 @@ def test_reading_back_means_the_message(sphere: Mesh, key: jm.Key, scheme):
 
 def test_reading_back_decodes_jointly_where_plain_correlations_fail(sphere: Mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(sphere, key, bits=64)
-    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back="never")
     monkeypatch.setattr(KeyedReader, "read_quickly", lambda *_: np.zeros(marker.code_bits))
     assert marker.reads(marked, MESSAGE)
 
 
 def test_what_correlations_read_is_not_decoded_jointly_and_is_paid_for(sphere: Mesh, key: jm.Key, monkeypatch):
     marker = jm.make_marker(sphere, key, bits=64)
-    marked, _ = marker.embed(MESSAGE, 8e-4, read_back=False)
+    marked, _ = marker.embed(MESSAGE, 8e-4, read_back="never")
     flat = bounds.log10_p_tag(28)
     monkeypatch.setattr(bounds, "log10_p_score", lambda *_: 0.0)  # what the tag alone proves is left
     with monkeypatch.context() as without:

@@ -85,12 +85,12 @@ def _align(original: Mesh, suspect: Mesh) -> Alignment:
 
 def _embed(scheme: Scheme, mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
     marker = _once(make_marker, mesh, key, bits=len(message), scheme=scheme)
-    return marker.embed(np.packbits(message).tobytes(), Budget(rms=strength, noise=0), read_back=False)[0]
+    return marker.embed(np.packbits(message).tobytes(), Budget(rms=strength, noise=0), read_back="never")[0]
 
 
 def _embed_blind(scheme: BlindScheme, mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
     marker = _once(make_blind_marker, mesh, key, bits=len(message), scheme=scheme)
-    return marker.embed(np.packbits(message).tobytes(), strength, read_back=False)[0]
+    return marker.embed(np.packbits(message).tobytes(), strength, read_back="never")[0]
 
 
 def _read(scheme: Scheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:

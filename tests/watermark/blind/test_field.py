@@ -316,11 +316,25 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
         jm.detect(shape, key=key, record=record)
 
 
-def test_payloads_that_a_mesh_cannot_hold_are_refused_before_they_are_written(shape: Mesh, key: jm.Key, monkeypatch):
+def test_payloads_that_a_mesh_cannot_hold_are_refused_before_they_are_written(
+    shape: Mesh, key: jm.Key, tmp_path: Path, monkeypatch
+):
     anchors = make_blind_marker(shape, key, scheme=SCHEME).writer.hosts[WIDTH].size
     monkeypatch.setattr(Writer, "off", None)  # nothing is planned
     with pytest.raises(jm.JaxmarkError, match=f"at most {anchors} anchors .* too few for a message of 160 bits"):
         jm.embed(shape, bytes(20), key, scheme=SCHEME)
+    source, budget = tmp_path / "shape.obj", jm.Budget.of(None)
+    jm.save_mesh(shape, source)
+    with pytest.raises(jm.JaxmarkError, match="too few for a message of 160 bits"):
+        mark_files.mark_file(
+            source,
+            tmp_path / "out.obj",
+            tmp_path / "out.json",
+            key=key,
+            message=bytes(20),
+            budget=budget,
+            scheme=SCHEME,
+        )
     monkeypatch.undo()
     largest = (anchors - reading.TAG_BITS) // 8
     monkeypatch.setattr(writing, "_ROUNDS", None)  # nothing is written
@@ -496,7 +510,7 @@ def test_the_command_prints_the_limit(thin, tmp_path, monkeypatch):
 def test_several_marks_name_the_limit_as_well(thin):
     limits = {largest_stretch: 0.2}
     marker = CombinedMarker(jm.make_marker(thin.original.mesh, thin.key, bits=0), (thin.scheme,))
-    (note,) = marker.embed(b"", jm.Budget(limits=limits), read_back=False)[1].notes
+    (note,) = marker.embed(b"", jm.Budget(limits=limits), read_back="never")[1].notes
     assert note.startswith("The limit of largest_stretch, 0.2, allows only ")
 
 

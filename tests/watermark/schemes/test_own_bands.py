@@ -53,7 +53,7 @@ def test_other_bands_have_other_signs_and_an_edited_record_is_refused(mesh: Mesh
     marks = [jm.make_marker(mesh, key, bits=16, scheme=scheme) for scheme in (one, two)]
     first, second = (np.asarray(mark.carrier.chips.signs) for mark in marks)  # pyright: ignore
     assert 0.4 < np.mean(first[first != 0] != second[first != 0]) < 0.6
-    _, info = marks[0].embed(b"ok", jm.Budget(rms=8e-4, noise=0), read_back=False)
+    _, info = marks[0].embed(b"ok", jm.Budget(rms=8e-4, noise=0), read_back="never")
     edited = dataclasses.replace(info.record, parameters=parameters_of(two))
     with pytest.raises(jm.JaxmarkError, match="edited"):
         jm.make_marker(mesh, key, record=edited)
@@ -124,7 +124,7 @@ def test_a_key_holder_who_edits_bands_of_equal_effect_reads_nothing(mesh: Mesh, 
     """The signs are others, even where the bands pass the same energy; the claim of the message is no way around."""
     own = OwnBandsScheme.from_arrays(BANDS)
     marker = jm.make_marker(mesh, key, bits=16, scheme=own)
-    marked, info = marker.embed(b"ok", jm.Budget(rms=2e-3, noise=0), read_back=False)
+    marked, info = marker.embed(b"ok", jm.Budget(rms=2e-3, noise=0), read_back="never")
     parameters = parameters_of(OwnBandsScheme.from_arrays(changed(np.asarray(BANDS))[change]))
     edited = dataclasses.replace(info.record, parameters=parameters, message_commitment="").sealed(key)
     other = jm.make_marker(mesh, key, record=edited)
@@ -147,7 +147,7 @@ def test_a_common_factor_of_the_bands_changes_nothing(mesh: Mesh, key: jm.Key, s
 )
 def test_whole_numbers_in_a_scheme_are_read_back_from_its_record(mesh: Mesh, key: jm.Key, scheme, tmp_path):
     marker = jm.make_marker(mesh, key, bits=0, scheme=scheme)
-    marked, info = marker.embed(b"", 2e-3, read_back=False)
+    marked, info = marker.embed(b"", 2e-3, read_back="never")
     (tmp_path / "record.json").write_text(info.record.to_json())
     record = jm.Record.load(tmp_path / "record.json")
     assert jm.detect(marked, original=mesh, key=key, record=record).detected()
