@@ -11,7 +11,7 @@ log10 p     of the false-positive probability, the worst and the best of the cop
 agreement   mean cosine of the anchors' phases, the least of the copies
 seconds     of the slowest reading
 predicted   nρ² after the attack, from the unmarked mesh: n anchors are found, and ρ is the mean cosine that is left;
-            not with --record
+            not with --record, nor for `rooted`, whose anchors are only found on marked meshes
 
 For the prediction, the unmarked mesh is attacked, and its anchors' values, after the best small change of pose, are
 compared with the values before. With the root mean square σ of the changes, and the share α of the way to the lattice
@@ -150,7 +150,7 @@ def measure(mesh: Mesh, marked: list[Copy], attacks: list[str], by_record: bool)
         try:
             suspects = [attacked(one.marked, steps, seed) for seed, one in enumerate(marked)]
             cells = [read(suspect, one.key, one, by_record) for suspect, one in zip(suspects, marked, strict=True)]
-            is_predicted = "width" in marked[0].info.record.parameters and not by_record
+            is_predicted = not (by_record or marked[0].scheme.by_key) and "width" in marked[0].info.record.parameters
             predicted = f"{predict(mesh, steps, marked[0]):.0f}" if is_predicted else ""
         except jm.JaxmarkError as refusal:
             print(line(steps, f"failed: {refusal}"), flush=True)

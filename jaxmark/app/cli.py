@@ -96,7 +96,7 @@ def cli() -> None:
       jaxmark detect suspect.ply --original model.ply --key owner.key
 
     Mesh files are OBJ, PLY, OFF, STL, GLB, glTF, 3MF or USD. Point clouds are PLY, XYZ, LAS or LAZ. Keep the key
-    secret. Keep the original, too: only marks of the blind schemes `field` and `local` are detected without it.
+    secret. Keep the original, too: only marks of the blind schemes `field`, `local` and `rooted` are read without it.
     """  # noqa: D301
 
 
@@ -135,8 +135,8 @@ def keygen(keyfile: Path, as_json: bool) -> None:
     type=Schemes(),
     default=DEFAULT_SCHEME,
     show_default=True,
-    help=f"Scheme that carries the bits: {', '.join(NAMES)}. Marks of `field` and `local` are read without the"
-    " original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
+    help=f"Scheme that carries the bits: {', '.join(NAMES)}. Marks of `field`, `local` and `rooted` are read without"
+    " the original. Several schemes, separated by commas (keyed,field), mark the mesh with each of them.",
 )
 @click.option(
     "--no-hint",
@@ -213,7 +213,7 @@ def embed_command(
 
 @cli.command(name="detect")
 @click.argument("suspect", type=FILE)
-@click.option("--original", type=FILE, help="The unmarked mesh; not needed for marks of `field` and `local`.")
+@click.option("--original", type=FILE, help="The unmarked mesh; not needed for blind marks.")
 @KEY
 @click.option(
     "--bits", type=int, help=f"Payload in bits, a multiple of 8.  [default: the record's, else {DEFAULT_BITS}]"
@@ -277,8 +277,8 @@ def detect_command(
 ) -> None:
     """Detect a mark in SUSPECT: a mesh file, in any pose and with any connectivity, or a folder of such files.
 
-    Needs the key and, except for the blind schemes `field` and `local`, the original. With the mark's record, the
-    original may be a copy that was saved in another format, rounded, moved as a whole or reordered.
+    Needs the key and, except for the blind schemes `field`, `local` and `rooted`, the original. With the mark's record,
+    the original may be a copy that was saved in another format, rounded, moved as a whole or reordered.
 
     Prints the message and a bound on the false-positive probability. The bound holds for every suspect that was made
     without the key, if key, original, record and a claimed message were fixed before the suspect existed. A second

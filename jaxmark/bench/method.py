@@ -26,9 +26,10 @@ from jaxmark.geometry.mesh import Mesh
 
 Bits = Bool[np.ndarray, " bits"]
 
+_BUILTIN = ("keyed", "eigen", "host", "paper", "field", "local", "rooted", "harmonics")
 #: The factory of each method, which takes the payload in bits: a module of `jaxmark.bench.methods` and a function.
 METHODS: Mapping[str, str] = {
-    **{name: f"builtin_schemes:{name}" for name in ("keyed", "eigen", "host", "paper", "field", "local", "harmonics")},
+    **{name: f"builtin_schemes:{name}" for name in _BUILTIN},
     "cho": "vertex_norms:cho",
     "cho-variance": "vertex_norms:cho_variance",
     "radial": "radial:radial",

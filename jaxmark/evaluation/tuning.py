@@ -238,6 +238,11 @@ def tune_blind(
             f"tune_blind tunes the schemes that are read without the original ({', '.join(BLIND_SCHEMES)}), not"
             f" {scheme!r}; for the others there is tune."
         )
+    if blind.by_key:
+        raise JaxmarkError(
+            f"The anchors of the scheme {blind.name!r} are found on marked meshes only, so that nothing can be compared"
+            " on an unmarked one; tune 'field' or 'local'."
+        )
     writer = make_blind_marker(mesh, _PUBLIC_KEY, bits=bits, scheme=blind).writer
     word = codeword(bytes(bits // 8), writer.choices)
     allowances = writer.allowances(word, Budget.of(budget).bounds(mesh), reference_of(writer.original))

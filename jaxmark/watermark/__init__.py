@@ -10,6 +10,7 @@ from jaxmark.watermark.bits import embed_bits as embed_bits
 from jaxmark.watermark.bits import log_evidence as log_evidence
 from jaxmark.watermark.blind.field import FieldScheme as FieldScheme
 from jaxmark.watermark.blind.local import LocalScheme as LocalScheme
+from jaxmark.watermark.blind.rooted import RootedScheme as RootedScheme
 from jaxmark.watermark.coding.keys import Key as Key
 from jaxmark.watermark.coding.keys import load_key as load_key
 from jaxmark.watermark.coding.keys import new_key as new_key

@@ -71,8 +71,8 @@ def embed(
             - a name or a scheme that is read with the original, see `make_marker`. If the default scheme is given by
               name, its pass band is adapted to the budget (`jaxmark.watermark.schemes.passband`); a scheme keeps its
               own pass band.
-            - `"field"` or `"local"`, whose marks are blind: they are read after any remeshing or from any part,
-              respectively.
+            - `"field"`, `"local"` or `"rooted"`, whose marks are blind: they are read after any remeshing, from any
+              part, or from remeshed parts, respectively.
             - several names, such as `("keyed", "field")`, for several marks within one budget. The first is read with
               the original and has the record, the others are blind.
 
@@ -162,8 +162,8 @@ def detect(
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
         scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` with an
-            original, and any blind scheme without it. Several names stand for marks that were embedded together, whose
-            evidence is united.
+            original, and `"field"` or `"local"` without it. Several names stand for marks that were embedded together,
+            whose evidence is united.
         detector: a detector, see `make_marker`.
         weights: one number of at least 0 for each vertex of the original: how far to trust the suspect there, 0 for not
             at all; **must not depend on the key**.
@@ -223,13 +223,14 @@ def read_blind(
     record: Record | None = None,
     schemes: Sequence[BlindScheme] = (),
 ) -> Detection:
-    """Read a blind mark of the given schemes, or else of any of `BLIND_SCHEMES`; see `detect`.
+    """Read a blind mark of the given schemes, or else of all that are not found by the key; see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
     """
     check_mesh(suspect)
-    candidates = schemes or tuple(BLIND_SCHEMES.values())
+    # Those that are found by the key take long, and are read only if they are named.
+    candidates = schemes or tuple(scheme for scheme in BLIND_SCHEMES.values() if not scheme.by_key)
     payload = DEFAULT_BITS if bits is None else bits
     if record is not None:
         payload = record.payload(key, bits)
@@ -250,7 +251,9 @@ def read_blind(
         detections.append(detection)
         if blind_reading.is_sure(detection):
             break
-    return blind_reading.best_of(detections, ledger.BLIND_SCHEME, len(candidates))
+    # Whoever names a scheme may have tried the others before.
+    tries = 1 if record is not None else max(len(BLIND_SCHEMES), len(candidates))
+    return blind_reading.best_of(detections, ledger.BLIND_SCHEME, tries)
 
 
 def with_blind(

@@ -129,6 +129,7 @@ host = partial(_method, HostScheme(), _SOHN, "")
 paper = partial(_method, HostScheme(kernel="printed", damping="none", unit_norm=False), f"{_SOHN}, as printed", "")
 field = partial(_method, SharedField(), "jaxmark, docs/blind.md", _OURS)
 local = partial(_method, BLIND_SCHEMES["local"], "jaxmark, docs/blind.md", _OURS)
+rooted = partial(_method, BLIND_SCHEMES["rooted"], "jaxmark, docs/blind.md", _OURS)
 
 
 def harmonics(bits: int) -> Method:

@@ -353,6 +353,20 @@ class Changes(NamedTuple):
 
 
 @jax.jit
+def slopes(
+    surface: Patches, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]
+) -> tuple[Shown, Float[Array, "anchors 3"]]:
+    """Measure the values of anchors, and their derivatives as the anchors move."""
+
+    def total(shift: Float[Array, "anchors 3"]) -> tuple[Float[Array, ""], Shown]:
+        shown = look(surface, anchors, shift, width, undone)
+        return shown.values.sum(), shown
+
+    slope, shown = jax.grad(total, has_aux=True)(jnp.zeros(anchors.places.shape, surface.points.dtype))
+    return shown, slope
+
+
+@jax.jit
 def changes(surface: Patches, anchors: Anchors, width: Float[Array, ""], undone: Float[Array, ""]) -> Changes:
     """Measure the values of anchors, and their derivatives with respect to small motions and scalings of the surface.
 
@@ -360,12 +374,7 @@ def changes(surface: Patches, anchors: Anchors, width: Float[Array, ""], undone:
     larger unit.
     """
     no_shift = jnp.zeros(anchors.places.shape, surface.points.dtype)
-
-    def total(shift: Float[Array, "anchors 3"]) -> tuple[Float[Array, ""], Shown]:
-        shown = look(surface, anchors, shift, width, undone)
-        return shown.values.sum(), shown
-
-    slope, shown = jax.grad(total, has_aux=True)(no_shift)
+    shown, slope = slopes(surface, anchors, width, undone)
     _, widened = jax.jvp(lambda size: look(surface, anchors, no_shift, size, undone).values, (width,), (width,))
     spread = jnp.sum(slope * jnp.asarray(anchors.places, slope.dtype), axis=1)
     return Changes(shown, slope, spread + widened - shown.values)

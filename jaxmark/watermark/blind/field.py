@@ -4,44 +4,36 @@ A suspect is read in several views: as it is, with some blur that remeshing may 
 of smoothing steps undone. Its pose is nearly that of the marked mesh, up to half turns and reflections along its axes.
 """
 
-import math
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import ClassVar
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Float64, Int
+from jaxtyping import Array, Float, Float64
 from scipy.spatial.transform import Rotation
 from scipy.special import ndtr
 
 from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, edges
+from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
-from jaxmark.geometry.surfaces import Moments, surface_moments, volume_moments
-from jaxmark.spectral.bands import heat
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import common_laplacian, pad_rows
-from jaxmark.spectral.precision import matmul
-from jaxmark.watermark.blind.anchors import WIDER, Anchors, Changes, Pieces, changes, encloses, look, place, see, turned
+from jaxmark.watermark.blind.anchors import WIDER, Anchors, Changes, changes, encloses, look, place, see, turned
 from jaxmark.watermark.blind.hint import GROUPS, MOST_POSES, Hint, Posed
 from jaxmark.watermark.blind.landmarks import Border
 from jaxmark.watermark.blind.scheme import LOOKS_AGAIN, AnchoredHost, BlindScheme, Look, measure
+from jaxmark.watermark.blind.shape import Shape, inverse_areas, smoothing_of
 from jaxmark.watermark.coding.keys import Choices
 
-_LEAST_AREA = 0.2  # lower limit on the area of a vertex, relative to the mean
 _FIRST_STEP = 0.05  # quantisation step that is tried first, in widths
 _MIN_GAP = 0.02  # least difference of the variances along two axes, over the largest, with which axes are distinct
 _UNDONE_STEPS = (0, 10, 30, 50)  # numbers of smoothing steps to undo; each step is a tenth of the way to the mean
 _BLURS = (0.0, 0.2)  # blurs of a suspect that was not smoothed, in shares of the narrow Gaussian's variance
 _DEGREE = 64  # degree of the polynomial that undoes smoothing
-_SMOOTHING = 0.5  # share of the narrow Gaussian's width by which displacements are smoothed
-_LONGEST = 100.0  # largest number of diffusion steps for that
-_TERMS = 3.7  # terms of a series over the root of the time of diffusion
 _REFINEMENTS = 8  # iterations of the fixed-point iteration that undoes smoothing
 _STEP_SIZE = 0.1
 #: Standard deviations of the small changes of pose that are tried: turns in radians, shifts and growth in sizes.
@@ -105,7 +97,7 @@ class FieldScheme(BlindScheme):
         dtype, rows = original.signal.dtype, original.to_traced(original.positions)
         faces = turned(faces) if placement.inside_out else faces
         matrix, shift = jnp.asarray(placement.pose.matrix, dtype), jnp.asarray(placement.pose.shift, dtype)
-        closed, free, hosts = encloses(original.points), _inverse_areas(original), {}
+        closed, free, hosts = encloses(original.points), inverse_areas(original), {}
         views = see(Mesh(placement.pose(original.positions), faces), self.widths, dtype)
         for width, (pieces, surface, anchors) in views.items():
             size = jnp.asarray(width, dtype)
@@ -114,7 +106,7 @@ class FieldScheme(BlindScheme):
             good = np.asarray(measured.good, np.float64)
             _, pose = measure(shape, rows)
             values = np.asarray(measured.values, np.float64)
-            smoothing = _smoothing(original, width)
+            smoothing = smoothing_of(original, width)
             hosts[width] = AnchoredHost(shape, anchors.cells, values, pose, good, free, smoothing, _FIRST_STEP * width)
         return hosts
 
@@ -246,50 +238,6 @@ def _by_pose(view: Changes, places: Float64[np.ndarray, "anchors 3"]) -> Float[A
     """Compute the derivatives of values with respect to turns, shifts and growth, as `_SPREAD` lists them."""
     positions = jnp.asarray(places, view.slope.dtype)
     return jnp.concatenate([jnp.cross(positions, view.slope), view.slope, view.growth[:, None]], axis=1)
-
-
-@jax.tree_util.register_dataclass
-@dataclass(frozen=True)
-class Shape:
-    """A mesh prepared for measuring the values of its anchors as a function of its vertices; a pytree."""
-
-    matrix: Float[Array, "3 3"]  # linear part of the map to the mesh's own pose
-    shift: Float[Array, " 3"]
-    faces: Int[Array | np.ndarray, "faces 3"]
-    pieces: Pieces
-    anchors: Anchors
-    width: Float[Array, ""]  # width of the narrow Gaussian
-    closed: bool = field(metadata={"static": True})  # whether the mesh encloses a volume
-
-    def measure(self, vertices: Float[Array, "rows 3"]) -> tuple[Float[Array, " anchors"], Float[Array, " nine"]]:
-        """Measure the anchors' values, and the centre and covariance of the mesh in its original pose."""
-        placed = matmul(vertices, self.matrix.T) + self.shift
-        no_shift = jnp.zeros(self.anchors.places.shape, vertices.dtype)
-        values = look(self.pieces.of(placed), self.anchors, no_shift, self.width, jnp.zeros_like(self.width)).values
-        moments: Moments = (volume_moments if self.closed else surface_moments)(placed[self.faces])
-        upper = jnp.triu_indices(3)
-        return values, jnp.concatenate([moments.centre, moments.covariance[upper]])
-
-
-def _inverse_areas(original: Original) -> Float[Array, " rows"]:
-    """Compute the inverse of the area around each point, relative to the mean."""
-    points, faces = original.positions, np.asarray(original.points.faces)
-    a, b, c = (points[faces[:, corner]] for corner in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
-    areas = np.bincount(faces.ravel(), np.repeat(area, 3), len(points))
-    mean = areas[original.used].mean()
-    return original.to_traced(np.where(original.used, mean / np.maximum(areas, _LEAST_AREA * mean), 0))
-
-
-def _smoothing(original: Original, width: float) -> Float64[np.ndarray, " terms"]:
-    """Compute the series of a diffusion by a share of the width, which hides the surface's pieces in displacements.
-
-    Diffusion exp(-tΔ) takes t steps along edges on average, which moves a point by √(t/2) edges along each direction.
-    """
-    ends = original.positions[edges(np.asarray(original.points.faces))]
-    edge = float(np.median(np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1)))
-    time = min(2 * (_SMOOTHING * width / edge) ** 2, _LONGEST)
-    return heat([time], 4 * math.ceil(_TERMS * math.sqrt(time) / 4))[0]
 
 
 def unsmoothed(mesh: Mesh, steps: int) -> Mesh:

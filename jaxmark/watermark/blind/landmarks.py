@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
 from jaxmark.geometry.pose import Pose
-from jaxmark.watermark.blind.anchors import REACH, Anchors, Patches, alike, anchors_at, changes, cut, look, patches
+from jaxmark.watermark.blind.anchors import REACH, Anchors, Patches, alike, anchors_at, cut, look, patches, slopes
 
 _COARSER = 2.5  # the surface is cut into pieces for a Gaussian so much wider; more pieces would change little
 _AROUND = 1.6  # distance, in widths, within which a value is the largest
@@ -146,10 +146,10 @@ def _measure(surface: Patches, anchors: Anchors, places: _Vectors) -> _Seen:
     moved = anchors.places.copy()
     moved[: len(places)] = places
     dtype = surface.points.dtype
-    seen = changes(surface, anchors._replace(places=moved), jnp.ones((), dtype), jnp.zeros((), dtype))
-    columns = (seen.slope, seen.shown.normals, seen.shown.away)
-    slopes, normals, away = (np.asarray(column, np.float64)[: len(places)] for column in columns)
-    return _Seen(slopes, normals, away, np.asarray(seen.shown.good)[: len(places)])
+    shown, slope = slopes(surface, anchors._replace(places=moved), jnp.ones((), dtype), jnp.zeros((), dtype))
+    columns = (slope, shown.normals, shown.away)
+    slope, normals, away = (np.asarray(column, np.float64)[: len(places)] for column in columns)
+    return _Seen(slope, normals, away, np.asarray(shown.good)[: len(places)])
 
 
 class _Extremes(NamedTuple):

@@ -212,7 +212,7 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
     counted = np.flatnonzero(view.good)
     if length > _MOST_PER_ANCHOR * len(counted):
         return []
-    dtype, steps = view.values.dtype, np.asarray(scheme.steps)
+    dtype, steps = view.values.dtype, np.asarray(view.steps or scheme.steps)
     errors = np.broadcast_to(view.error, view.good.shape)
     offsets, choices_per_turn = np.zeros(view.names.shape[:2]), []
     for turn, names in enumerate(view.names):

@@ -78,6 +78,7 @@ class Look(NamedTuple):
     by_hint: bool = False  # whether the pose was found by the hint of a record
     error: Float64[np.ndarray, " anchors"] | float = 0.0  # standard deviation of values because of a border beside them
     starts: int = STARTS  # number of small changes that are tried
+    steps: tuple[float, ...] = ()  # the only quantisation steps that it is read with; all of the scheme's by default
     #: Sees the suspect again after a small change of the view; returns None if that would show nothing more.
     again: "Callable[[Float64[np.ndarray, ' changes']], Look | None]" = _nothing_more
 
@@ -91,6 +92,9 @@ class BlindScheme(Protocol):
 
     name: ClassVar[str]  # the scheme's name in records and on the command line
     in_parts: ClassVar[bool]  # whether a part of the shape can be read alone
+    #: Whether a reader finds the anchors by the key: it takes long, and finds none in an unmarked mesh.
+    by_key: ClassVar[bool] = False
+    least_alpha: ClassVar[float] = 0.6  # least fraction α of the way to the lattice that values are moved
     remembered: ClassVar[tuple[str, ...]] = ()  # names of the texts that `recorded` may return
     __dataclass_fields__: ClassVar[dict[str, Any]]
     widths: tuple[float, ...]  # widths of the averages whose differences are the values

@@ -35,7 +35,6 @@ from jaxmark.watermark.perception.masking import apply_mask, masking_tensors
 _RIDGE = 3e-3  # relative to the mean square of a row; values that contradict each other are met halfway
 _HELD_RIDGE = 1e-4  # the same for the held quantities, whose rows are scaled to the size of the others
 _STEPS, _TOLERANCE = 60, 1e-2  # of the conjugate gradients
-_LEAST_ALPHA = 0.6  # least fraction α of the way to the lattice; steps differ by √2, so α is at most √2 times this
 _ROUNDS = 2  # number of Gauss-Newton steps
 _ENOUGH = 0.9  # share of the limits that must be reached for choosing a width and a step
 _SURE, _READS = 3.0, 1.0  # margins in standard deviations: for choosing a payload, and for predicting that it is read
@@ -304,7 +303,7 @@ class Writer:
 
     def steps(self, allowance: Allowance) -> list[float]:
         """List the quantisation steps with which the budget allows at least the least α."""
-        return [step for step in self.scheme.steps if allowance.allowed / step >= _LEAST_ALPHA]
+        return [step for step in self.scheme.steps if allowance.allowed / step >= self.scheme.least_alpha]
 
     def survives(self, plan: Plan, bits: int) -> Survival:
         """Predict the strongest noise in which a payload is read.

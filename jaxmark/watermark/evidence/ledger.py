@@ -195,7 +195,11 @@ BESIDE = Choice(
         Alternative("none", 0.97, PASS_BAND),
         Alternative("field", 0.01, MARKS),
         Alternative("local", 0.01, MARKS),
-        Alternative("field and local", 0.01, MARKS),
+        Alternative("rooted", 0.002, MARKS),
+        Alternative("field and local", 0.005, MARKS),
+        Alternative("field and rooted", 0.001, MARKS),
+        Alternative("local and rooted", 0.001, MARKS),
+        Alternative("field and local and rooted", 0.001, MARKS),
     ),
 )
 
@@ -211,8 +215,8 @@ SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE_ORDER), Altern
 # Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
 LOOKS = _each(
     "view",
-    "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn or reflection"
-    " or pose that a hint gives, and change of pose",
+    "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn, reflection, unit"
+    " with orientation of the faces, or pose that a hint gives, and change of pose",
     PAYLOAD,
     in_bound=True,
 )
@@ -224,7 +228,7 @@ BLIND_PROOF = Choice(
 BLIND_MESSAGE = Choice(
     "message", (Alternative("claimed or recorded", 0.97, BLIND_PROOF), Alternative("another", 0.03, BLIND_PROOF))
 )
-BLIND_SCHEME = _each("scheme (no record)", "1/n for each of the n blind schemes that are tried", BLIND_MESSAGE)
+BLIND_SCHEME = _each("scheme (no record)", "1/n for each of the n blind schemes", BLIND_MESSAGE)
 PARTS = _each("part of a file", "1/n for each of n distinct pairs of a mesh of the suspect and a record", BLIND_SCHEME)
 
 # Copies for recipients.

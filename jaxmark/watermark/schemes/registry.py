@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 from jaxmark.errors import JaxmarkError
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.local import LocalScheme
+from jaxmark.watermark.blind.rooted import RootedScheme
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.interfaces import Scheme
 from jaxmark.watermark.schemes.keyed import KeyedScheme
@@ -22,7 +23,9 @@ SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] 
     scheme.name: scheme for scheme in (KeyedScheme, HostScheme, EigenScheme)
 }
 #: The blind schemes, the fastest first.
-BLIND_SCHEMES: Mapping[str, BlindScheme] = {LocalScheme.name: LocalScheme(), FieldScheme.name: FieldScheme()}
+BLIND_SCHEMES: Mapping[str, BlindScheme] = {
+    scheme.name: scheme for scheme in (LocalScheme(), FieldScheme(), RootedScheme())
+}
 # Schemes that only records name, because they have no usual fields.
 _BY_RECORD: Mapping[str, type[Scheme]] = {**SCHEMES, OwnBandsScheme.name: OwnBandsScheme}
 NAMES = (*SCHEMES, *BLIND_SCHEMES)  # the names of all schemes

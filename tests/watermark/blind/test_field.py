@@ -422,7 +422,7 @@ def test_a_part_that_one_scheme_refuses_does_not_hide_what_another_proves(shape:
     alone = jm.detect(suspect, key=key, bits=32, scheme="local")
     found = jm.detect(suspect, key=key, bits=32)
     assert found.message == MESSAGE
-    assert found.log10_p == pytest.approx(alone.log10_p + np.log10(2), abs=1e-6)
+    assert found.log10_p == pytest.approx(alone.log10_p, abs=1e-6)
     with pytest.raises(jm.JaxmarkError, match="volume"):
         jm.detect(suspect, key=key, bits=32, scheme="field")
 

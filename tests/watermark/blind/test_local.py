@@ -16,7 +16,9 @@ from jaxmark.watermark import EmbedInfo, LocalScheme
 from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
+from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.markers import unite
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
 from tests.dense import laplacian_matrix
@@ -120,7 +122,9 @@ def test_all_blind_schemes_are_tried_and_paid_for(marked, key: jm.Key):
     alone = jm.detect(mesh, key=key, bits=8, scheme="local")
     found = jm.detect(mesh, key=key, bits=8)
     assert found.message == MESSAGE
-    assert found.log10_p == pytest.approx(alone.log10_p + math.log10(2))
+    assert found.log10_p == pytest.approx(alone.log10_p)
+    (charge,) = [one for one in found.evidence.charges if one.choice == ledger.BLIND_SCHEME.name]
+    assert charge.log10 == pytest.approx(math.log10(len(BLIND_SCHEMES)))
 
 
 @pytest.mark.slow
