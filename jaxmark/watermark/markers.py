@@ -365,9 +365,10 @@ class BlindMarker:
         unit = size * rng.uniform(-1, 1, self.original.positions.shape)[self.original.weld.point]
         faces = np.asarray(marked.faces)
         near = (points[faces, 0] <= np.median(points[faces, 0])).all(axis=1)
-        survived = []
+        # Reading marks that are found by the key takes long, so that only every second share is tried.
+        shares, survived = _SHARES_OF_NOISE[1:-1:2] if self.scheme.by_key else _SHARES_OF_NOISE[:-1], []
         for strongest, part in zip(predicted, (faces, faces[near]), strict=True):
-            strengths = [share * strongest for share in _SHARES_OF_NOISE[:-1] if strongest > 0]
+            strengths = [share * strongest for share in shares if strongest > 0]
             suspects = (Mesh(points + noise * unit, part) for noise in strengths)
             reads = (noise for noise, suspect in zip(strengths, suspects, strict=True) if self.reads(suspect, message))
             survived.append(next(reads, 0.0))

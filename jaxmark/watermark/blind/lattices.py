@@ -85,7 +85,7 @@ class Lattices(NamedTuple):
         return Lattices(*(column[chosen] for column in self))
 
 
-class Surface:
+class CutSurface:
     """A surface that is prepared for measuring the values of lattices; its mesh is in widths."""
 
     def __init__(self, mesh: Mesh) -> None:

@@ -26,7 +26,7 @@ from jaxmark.spectral.padding import pad_rows
 from jaxmark.watermark.blind.anchors import alike, anchors_at, encloses, moments_of, turned
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.landmarks import Landmarks
-from jaxmark.watermark.blind.lattices import CHANGES, Frames, Lattices, Surface, find_roots
+from jaxmark.watermark.blind.lattices import CHANGES, CutSurface, Frames, Lattices, find_roots
 from jaxmark.watermark.blind.roots import CLASSES, REGION, make_regions, names_of
 from jaxmark.watermark.blind.scheme import AnchoredHost, BlindScheme, Look, measure
 from jaxmark.watermark.blind.search import Found, random_changes, search
@@ -96,7 +96,7 @@ class RootedScheme(BlindScheme):
         for width in self.widths:
             size = width * _unit_of(original.diagonal) / original.diagonal
             scaled = mesh._replace(vertices=np.asarray(mesh.vertices) / size)
-            surface = Surface(scaled)
+            surface = CutSurface(scaled)
             regions = make_regions(scaled, surface)
             anchors = alike([anchors_at(surface.patches, regions.lattices.places, 1.0)])[0]
             to_widths, no_shift = jnp.eye(3, dtype=dtype) / size, jnp.zeros(3, dtype)
@@ -129,7 +129,7 @@ class RootedScheme(BlindScheme):
         for unit, width in product(units, self.widths):
             size = width * unit
             mesh, pose = Mesh((vertices - centre) / size, suspect.faces), Pose(np.eye(3) / size, -centre / size)
-            surface, landmarks = Surface(mesh), find_roots(mesh)
+            surface, landmarks = CutSurface(mesh), find_roots(mesh)
             reader = _Reader(surface, choices, np.asarray(self.steps))
             for inside_out, mirrored in product((False,) if is_closed else (False, True), (False, True)):
                 seen = landmarks.seen(Pose(np.eye(3), np.zeros(3)), inside_out=inside_out)
@@ -169,7 +169,7 @@ class _Rooted(NamedTuple):
 class _Reader:
     """A reader of one surface, with the keyed choices of a mark."""
 
-    def __init__(self, surface: Surface, choices: Choices, steps: Float64[np.ndarray, " steps"]) -> None:
+    def __init__(self, surface: CutSurface, choices: Choices, steps: Float64[np.ndarray, " steps"]) -> None:
         self._surface, self._choices, self._steps = surface, choices, steps
 
     def read(self, landmarks: Landmarks, width: float, pose: Pose, *, inside_out: bool, mirrored: bool) -> list[Look]:

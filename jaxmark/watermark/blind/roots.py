@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.anchors import SPACING
 from jaxmark.watermark.blind.landmarks import Landmarks
-from jaxmark.watermark.blind.lattices import RIM, Frames, Lattices, Surface, find_roots
+from jaxmark.watermark.blind.lattices import RIM, CutSurface, Frames, Lattices, find_roots
 
 CLASSES = 2  # largest number of roots of one kind
 REGION = 30.0  # distance from its root up to which a region reaches
@@ -53,7 +53,7 @@ def names_of(
     return np.concatenate([roots, lattices.cells], axis=1)
 
 
-def make_regions(mesh: Mesh, surface: Surface) -> Regions:
+def make_regions(mesh: Mesh, surface: CutSurface) -> Regions:
     """Choose the roots of an original, whose mesh is in widths, and divide its anchors among them.
 
     Raises:
@@ -102,7 +102,7 @@ def _degrees(
     return np.degrees(np.arccos(np.clip(np.sum(first * second, axis=1), -1, 1)))
 
 
-def _choose(landmarks: Landmarks, stability: Float64[np.ndarray, " landmarks"], surface: Surface) -> list[int]:
+def _choose(landmarks: Landmarks, stability: Float64[np.ndarray, " landmarks"], surface: CutSurface) -> list[int]:
     """Choose the roots with which most anchors are expected to be read from halves of the shape, one by one."""
     points = surface.points[np.random.default_rng(0).permutation(len(surface.points))[:_POINTS]]
     each = surface.area / len(points) / SPACING**2  # number of anchors that a point stands for
@@ -146,7 +146,7 @@ def _directions(count: int) -> Float64[np.ndarray, "count 3"]:
     return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
 
 
-def _divide(surface: Surface, roots: Landmarks) -> Regions:
+def _divide(surface: CutSurface, roots: Landmarks) -> Regions:
     """Give each anchor near the roots to the nearest root, and leave a gap between regions."""
     lattices = surface.lattices(Frames.of(roots), REGION)
     distance = np.linalg.norm(lattices.places[:, None] - roots.places, axis=2)

@@ -12,7 +12,7 @@ from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark import RootedScheme
 from jaxmark.watermark.blind import roots
-from jaxmark.watermark.blind.lattices import Frames, Lattices, Surface, find_roots
+from jaxmark.watermark.blind.lattices import CutSurface, Frames, Lattices, find_roots
 from jaxmark.watermark.blind.reading import read, register
 from jaxmark.watermark.blind.roots import make_regions
 from jaxmark.watermark.evidence import ledger
@@ -38,8 +38,8 @@ def scaled() -> Mesh:
 
 
 @pytest.fixture(scope="module")
-def surface(scaled: Mesh) -> Surface:
-    return Surface(scaled)
+def surface(scaled: Mesh) -> CutSurface:
+    return CutSurface(scaled)
 
 
 @pytest.fixture(scope="module")
@@ -58,12 +58,12 @@ def in_common(*lattices: Lattices) -> list[Lattices]:
     return [one.pick(np.array([row[name] for name in sorted(names)])) for one, row in zip(lattices, rows, strict=True)]
 
 
-def test_lattices_move_with_the_surface(scaled: Mesh, surface: Surface, frames: Frames):
+def test_lattices_move_with_the_surface(scaled: Mesh, surface: CutSurface, frames: Frames):
     """Reversed faces are seen as if they were not."""
     turn = Rotation.random(random_state=1).as_matrix()
     pose = Pose(turn, np.array([3.0, -1, 2]))
     moved = Frames(pose(frames.places), turn @ frames.axes, frames.kinds)
-    there = Surface(Mesh(pose(np.asarray(scaled.vertices)), np.asarray(scaled.faces)[:, ::-1]))
+    there = CutSurface(Mesh(pose(np.asarray(scaled.vertices)), np.asarray(scaled.faces)[:, ::-1]))
     here, seen = in_common(surface.lattices(frames, 10.0), there.lattices(moved, 10.0, inside_out=True))
     np.testing.assert_allclose(seen.places, pose(here.places), atol=1e-9)
     # The surface is cut into other pieces there.
@@ -71,7 +71,7 @@ def test_lattices_move_with_the_surface(scaled: Mesh, surface: Surface, frames: 
     assert np.std(here.values) > 0.05
 
 
-def test_slopes_are_derivatives_along_the_axes_of_frames(surface: Surface, frames: Frames):
+def test_slopes_are_derivatives_along_the_axes_of_frames(surface: CutSurface, frames: Frames):
     for change in 0.02 * np.eye(6):
         moved = (frames.moved(np.tile(way * change, (6, 1))) for way in (0, 1, -1))
         before, after, behind = in_common(*(surface.lattices(one, 10.0) for one in moved))
@@ -79,12 +79,12 @@ def test_slopes_are_derivatives_along_the_axes_of_frames(surface: Surface, frame
         np.testing.assert_allclose(before.slopes @ change / 0.02, difference, atol=0.02 * np.abs(difference).max())
 
 
-def test_rough_values_differ_by_less_than_a_tenth_of_the_least_step(surface: Surface, frames: Frames):
+def test_rough_values_differ_by_less_than_a_tenth_of_the_least_step(surface: CutSurface, frames: Frames):
     exact, approximate = in_common(*(surface.lattices(frames, 10.0, rough=is_rough) for is_rough in (False, True)))
     assert np.sqrt(np.mean((exact.values - approximate.values) ** 2)) < 0.1 * min(RootedScheme().steps)
 
 
-def test_each_anchor_belongs_to_the_nearest_root_and_has_one_name(scaled: Mesh, surface: Surface, monkeypatch):
+def test_each_anchor_belongs_to_the_nearest_root_and_has_one_name(scaled: Mesh, surface: CutSurface, monkeypatch):
     monkeypatch.setattr(roots, "_stability", lambda _, landmarks: landmarks.clarity / landmarks.clarity.max())
     regions = make_regions(scaled, surface)
     found = find_roots(scaled)
