@@ -336,8 +336,9 @@ def _caveats(scheme: BlindScheme, record: Record | None) -> tuple[str, ...]:
     usual = BLIND_SCHEMES[scheme.name]
     if record is None and not (set(scheme.widths) <= set(usual.widths) and set(scheme.steps) <= set(usual.steps)):
         return (f"the widths or steps of the scheme {scheme.name!r} were chosen by the reader",)
-    if record is None and scheme.looks > usual.looks:
-        return ("the hint was chosen by the reader; give the record",)
+    chosen = [name for name in scheme.remembered if getattr(scheme, name) != getattr(usual, name)]
+    if record is None and chosen:
+        return (f"the {' and the '.join(chosen)} was chosen by the reader; give the record",)
     return ()
 
 

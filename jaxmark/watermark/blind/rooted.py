@@ -42,6 +42,7 @@ _CLOSER, _FEWER = 0.4, 64  # factor on the changes, and their number, for landma
 _CORE = (10.0, 14.0)  # distances from a landmark up to which anchors must fit: either is enough
 #: The same for landmarks that are looked at again, and how many are kept for each root.
 _FARTHER = (((10.0, 14.0, 20.0), 3), ((14.0, 20.0, 25.0, REGION), 1))
+_MOST_LANDMARKS = 400  # of a suspect, the clearest
 _CANDIDATES = 12  # landmarks that are looked at again for each root
 _FEWEST = 12  # least number of anchors that can fit
 _BY_CHANCE = 5.0  # fits up to this one occur by chance
@@ -57,7 +58,7 @@ class RootedScheme(BlindScheme):
     """A blind scheme that writes values in lattices that begin at landmarks; read from parts, also remeshed ones.
 
     Raises:
-        JaxmarkError: if the unit is none.
+        JaxmarkError: if the unit is no power of √2.
     """
 
     name: ClassVar[str] = "rooted"
@@ -74,11 +75,11 @@ class RootedScheme(BlindScheme):
     def __post_init__(self) -> None:
         """Check the unit."""
         try:
-            is_length = not self.unit or 0 < float(self.unit) < math.inf
-        except ValueError:
-            is_length = False
-        if not is_length:
-            raise JaxmarkError("The record is damaged: its unit is no length. Use an unedited copy.")
+            is_power = not self.unit or _unit_of(float(self.unit)) == float(self.unit)
+        except (ValueError, OverflowError):  # zero, negative, infinite, or no number
+            is_power = False
+        if not is_power:
+            raise JaxmarkError("The record is damaged: its unit is no power of √2. Use an unedited copy.")
 
     @property
     def looks(self) -> int:
@@ -129,7 +130,7 @@ class RootedScheme(BlindScheme):
         for unit, width in product(units, self.widths):
             size = width * unit
             mesh, pose = Mesh((vertices - centre) / size, suspect.faces), Pose(np.eye(3) / size, -centre / size)
-            surface, landmarks = CutSurface(mesh), find_roots(mesh)
+            surface, landmarks = CutSurface(mesh), find_roots(mesh).clearest(_MOST_LANDMARKS)
             reader = _Reader(surface, choices, np.asarray(self.steps))
             for inside_out, mirrored in product((False,) if is_closed else (False, True), (False, True)):
                 seen = landmarks.seen(Pose(np.eye(3), np.zeros(3)), inside_out=inside_out)

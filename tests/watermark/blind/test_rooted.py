@@ -11,7 +11,7 @@ import jaxmark as jm
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark import RootedScheme
-from jaxmark.watermark.blind import roots
+from jaxmark.watermark.blind import reading, roots
 from jaxmark.watermark.blind.lattices import CutSurface, Frames, Lattices, find_roots
 from jaxmark.watermark.blind.reading import read, register
 from jaxmark.watermark.blind.roots import make_regions
@@ -108,8 +108,9 @@ def test_damaged_units_are_refused():
     usual = BLIND_SCHEMES["rooted"]
     parameters = {"width": usual.widths[0], "step": usual.steps[0]}
     assert make_blind_scheme("rooted", {**parameters, "unit": "2.0"}).looks == 4
-    for unit in ("0", "-1", "inf", "nan", "much"):
-        with pytest.raises(jm.JaxmarkError, match="unit is no length"):
+    assert make_blind_scheme("rooted", {**parameters, "unit": repr(2.0**0.5)}).looks == 4
+    for unit in ("0", "-1", "inf", "nan", "much", "1.5", "1.4142"):
+        with pytest.raises(jm.JaxmarkError, match="unit is no power"):
             make_blind_scheme("rooted", {**parameters, "unit": unit})
 
 
@@ -118,6 +119,13 @@ def test_whoever_names_a_scheme_is_charged_for_the_others(monkeypatch):
     found = jm.detect(rough(), key=KEY, scheme="rooted", bits=8)
     (charge,) = [one for one in found.evidence.charges if one.choice == ledger.BLIND_SCHEME.name]
     assert charge.log10 == pytest.approx(np.log10(len(BLIND_SCHEMES)))
+
+
+def test_a_unit_that_the_reader_chose_proves_nothing():
+    """Otherwise one of many units could be charged as the only one."""
+    chosen = replace(BLIND_SCHEMES["rooted"], unit="2.0")
+    assert reading._caveats(chosen, None) == ("the unit was chosen by the reader; give the record",)
+    assert not reading._caveats(BLIND_SCHEMES["rooted"], None)
 
 
 def test_nothing_is_tuned_where_anchors_are_found_by_the_key():
