@@ -20,6 +20,7 @@ from jaxmark.watermark.blind.landmarks import Border, Landmarks, find_landmarks
 RIM = 2.2  # least distance of anchors from a border
 CHANGES = 6  # small changes of a frame: turns and shifts
 _SCALES = tuple(2 ** (power / 3) for power in (1, 2, 3))  # widths of the Gaussians of landmarks
+_MOST = 400  # largest number of landmarks that may be roots
 _COARSER = 1.3  # rough values are those of pieces so much larger: they differ by about 0.0015 widths
 _NEAR = 0.75  # distance of lattice points from the surface, in spacings, up to which values are measured
 _CHUNK = 2048  # places that are measured at once, to limit the memory
@@ -29,12 +30,12 @@ _Places = Float64[np.ndarray, "places 3"]
 
 
 def find_roots(mesh: Mesh) -> Landmarks:
-    """Find the landmarks of a surface that may be roots.
+    """Find the landmarks of a surface that may be roots, no more than writer and reader can try: the clearest first.
 
     Raises:
         JaxmarkError: if the surface is too large.
     """
-    return find_landmarks(mesh, _SCALES)
+    return find_landmarks(mesh, _SCALES).clearest(_MOST)
 
 
 class Frames(NamedTuple):

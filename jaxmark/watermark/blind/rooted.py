@@ -42,7 +42,6 @@ _CLOSER, _FEWER = 0.4, 64  # factor on the changes, and their number, for landma
 _CORE = (10.0, 14.0)  # distances from a landmark up to which anchors must fit: either is enough
 #: The same for landmarks that are looked at again, and how many are kept for each root.
 _FARTHER = (((10.0, 14.0, 20.0), 3), ((14.0, 20.0, 25.0, REGION), 1))
-_MOST_LANDMARKS = 400  # of a suspect, the clearest
 _CANDIDATES = 12  # landmarks that are looked at again for each root
 _FEWEST = 12  # least number of anchors that can fit
 _BY_CHANCE = 5.0  # fits up to this one occur by chance
@@ -130,7 +129,7 @@ class RootedScheme(BlindScheme):
         for unit, width in product(units, self.widths):
             size = width * unit
             mesh, pose = Mesh((vertices - centre) / size, suspect.faces), Pose(np.eye(3) / size, -centre / size)
-            surface, landmarks = CutSurface(mesh), find_roots(mesh).clearest(_MOST_LANDMARKS)
+            surface, landmarks = CutSurface(mesh), find_roots(mesh)
             reader = _Reader(surface, choices, np.asarray(self.steps))
             for inside_out, mirrored in product((False,) if is_closed else (False, True), (False, True)):
                 seen = landmarks.seen(Pose(np.eye(3), np.zeros(3)), inside_out=inside_out)
