@@ -451,6 +451,21 @@ def test_a_surface_with_little_more_than_the_shape_is_read_as_a_whole_only():
 
 
 @pytest.mark.slow
+def test_what_remeshing_smoothed_is_kept_apart_from_the_mark():
+    """Remeshing cuts off what sticks out, which is most of the displacement; the mark is read from the rest."""
+    pytest.importorskip("pymeshlab")
+    mesh, key = rough_sphere(1500), b"k" * 32
+    marked, _ = jm.embed(mesh, b"p", key)
+    found = align(make_original(mesh), jm.attack(marked, "isotropic", 1, seed=0))
+    assert found.method == "surface"
+    assert found.nuisance is not None
+    reader = jm.make_marker(mesh, key, bits=8)
+    blurred = reader.read(found._replace(nuisance=None), b"p")
+    assert reader.read(found, b"p").log10_p < blurred.log10_p - 3 < -10
+    assert jm.make_marker(mesh, b"w" * 32, bits=8).read(found, b"p").log10_p > -2
+
+
+@pytest.mark.slow
 def test_what_cannot_be_aligned_is_refused(original: Original):
     for other in (bumpy_sphere(4, 3), make_mesh(*tetrahedron())):
         with pytest.raises(jm.JaxmarkError, match="could not be aligned"):
