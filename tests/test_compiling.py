@@ -119,4 +119,4 @@ def test_few_programs_are_compiled(key: jm.Key, caplog: pytest.LogCaptureFixture
     suspect = jm.attack(marked, "simplification", 0.3, seed=0)
     found, remeshed = compiled(lambda: jm.detect(suspect, original=mesh, key=key, record=info.record))
     assert found.detected()
-    assert 0 < len(remeshed) <= 5, remeshed
+    assert 0 < len(remeshed) <= 6, remeshed  # one of them joins what simplification smoothed to the other nuisance

@@ -235,7 +235,7 @@ def embed_command(
     "schemes",
     type=Schemes(),
     help="Scheme that carries the bits, if there is no record. Several, as in `embed`, combine their evidence."
-    f"  [default: {DEFAULT_SCHEME}; without --original, all blind schemes]",
+    f"  [default: {DEFAULT_SCHEME}; without --original, field and local; rooted must be named]",
 )
 @ALIGN
 @click.option(

@@ -305,14 +305,8 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
         notes.append(
             f"Another message of this key was decoded than the one {'claimed' if claimed else 'in the record'}."
         )
-    if reading.view.undone:
-        notes.append(f"The suspect was read after undoing {reading.view.undone} steps of smoothing.")
-    if reading.view.by_hint:
-        notes.append("The suspect was read in a pose that was found by the record's hint, as parts are.")
-    if reading.view.mirrored[reading.turn]:
-        notes.append("The suspect is the mirror image of the marked mesh.")
     agreement = float(score[chosen] / max(reading.reliable, 1e-300))
-    return _nothing(scheme, claim, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
+    found = _nothing(scheme, claim, reading.soft, reading.anchored._replace(agreement=agreement))._replace(
         message=None if decoded is None else decoded.message,
         recorded=None if decoded is None else is_recorded(record, decoded.message, choices),
         evidence=weigh(
@@ -325,8 +319,22 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
             tag_was_open=bool(bits) and record is not None,
             caveats=_caveats(scheme, record),
         ),
-        notes=tuple(notes),
     )
+    if found.detected(allow_estimate=True):  # else the best view of the suspect is the best of chance
+        notes += _observations(reading)
+    return found._replace(notes=tuple(notes))
+
+
+def _observations(reading: Phases) -> list[str]:
+    """Return what was undone to the suspect, or found out about its pose."""
+    notes = []
+    if reading.view.undone:
+        notes.append(f"The suspect was read after undoing {reading.view.undone} steps of smoothing.")
+    if reading.view.by_hint:
+        notes.append("The suspect was read in a pose that was found by the record's hint, as parts are.")
+    if reading.view.mirrored[reading.turn]:
+        notes.append("The suspect is the mirror image of the marked mesh.")
+    return notes
 
 
 def _caveats(scheme: BlindScheme, record: Record | None) -> tuple[str, ...]:
