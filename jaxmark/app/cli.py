@@ -74,7 +74,7 @@ from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
 from jaxmark.watermark.record import RECORD_SUFFIX, Record, TimestampedCommitment, load_record, make_commitment
-from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, NAMES, AnyScheme
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, NAMES, USUAL_BLIND_SCHEMES, AnyScheme
 from jaxmark.watermark.tracing.tracer import identify
 
 
@@ -235,7 +235,7 @@ def embed_command(
     "schemes",
     type=Schemes(),
     help="Scheme that carries the bits, if there is no record. Several, as in `embed`, combine their evidence."
-    f"  [default: {DEFAULT_SCHEME}; without --original, field and local; rooted must be named]",
+    f"  [default: {DEFAULT_SCHEME}; without --original, {' and '.join(scheme.name for scheme in USUAL_BLIND_SCHEMES)}]",
 )
 @ALIGN
 @click.option(

@@ -40,6 +40,7 @@ from jaxmark.watermark.schemes.passband import ADAPTIVE, candidates
 from jaxmark.watermark.schemes.registry import (
     BLIND_SCHEMES,
     DEFAULT_SCHEME,
+    USUAL_BLIND_SCHEMES,
     AnyScheme,
     find_blind,
     get_nonblind,
@@ -223,14 +224,13 @@ def read_blind(
     record: Record | None = None,
     schemes: Sequence[BlindScheme] = (),
 ) -> Detection:
-    """Read a blind mark of the given schemes, or else of all that are not found by the key; see `detect`.
+    """Read a blind mark of the given schemes, or else of the usual ones; see `detect`.
 
     Raises:
         JaxmarkError: see `detect`.
     """
     check_mesh(suspect)
-    # Those that are found by the key take long, and are read only if they are named.
-    candidates = schemes or tuple(scheme for scheme in BLIND_SCHEMES.values() if not scheme.by_key)
+    candidates = schemes or USUAL_BLIND_SCHEMES
     payload = DEFAULT_BITS if bits is None else bits
     if record is not None:
         payload = record.payload(key, bits)

@@ -26,6 +26,8 @@ SCHEMES: Mapping[str, type[KeyedScheme] | type[HostScheme] | type[EigenScheme]] 
 BLIND_SCHEMES: Mapping[str, BlindScheme] = {
     scheme.name: scheme for scheme in (LocalScheme(), FieldScheme(), RootedScheme())
 }
+#: The blind schemes that are read if none is named. Those that are found by the key take long, and must be named.
+USUAL_BLIND_SCHEMES = tuple(scheme for scheme in BLIND_SCHEMES.values() if not scheme.by_key)
 # Schemes that only records name, because they have no usual fields.
 _BY_RECORD: Mapping[str, type[Scheme]] = {**SCHEMES, OwnBandsScheme.name: OwnBandsScheme}
 NAMES = (*SCHEMES, *BLIND_SCHEMES)  # the names of all schemes

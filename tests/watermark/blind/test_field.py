@@ -488,6 +488,13 @@ def test_a_limit_that_a_few_faces_make_tight_is_named(thin):
         thin.write(b"", jm.Budget(limits={"dame": 0.001}))
 
 
+@pytest.mark.parametrize("number", [1, 3])  # of keys for which the likeliest view of chance is mirrored, or smoothed
+def test_a_reading_that_detects_nothing_says_nothing_of_the_pose(number: int):
+    found = jm.detect(bumpy_sphere(4), key=bytes([number]) * 32, message=b"mine", scheme="field")
+    assert not found.detected(allow_estimate=True)
+    assert found.notes == ()
+
+
 def test_a_mark_that_does_not_read_back_is_refused_with_the_limit(thin, monkeypatch):
     monkeypatch.setattr(BlindMarker, "reads", lambda *_: False)
     with pytest.raises(jm.JaxmarkError, match=f"does not read back.*{TIGHT}"):
