@@ -113,7 +113,9 @@ def run(
     ]
     rows = []
     for some in (marks, suspects):
-        rows += cells.run(some, partial(run_task, bench), workers, Path(output) / "cells.jsonl", log, _title)
+        rows += cells.run(
+            some, partial(run_task, bench), workers, Path(output) / "cells.jsonl", log, _title, _suspect_of
+        )
     return BenchResults(loaded, tuple(rows), skipped, rate)
 
 
@@ -130,6 +132,12 @@ def _suspects(task: Task, track: Track, methods: Sequence[str], keys: int) -> It
         for limits, other in product(first, methods):
             if other != task.method:
                 yield task._replace(limits=limits, source=other, attack="none")
+
+
+def _suspect_of(cell: cells.Cell) -> Task:
+    """Return what the readings of one suspect share; it is aligned once for all methods and keys."""
+    task = Task(*cell)  # pyright: ignore[reportArgumentType] (see `run_task`)
+    return task if task.source == task.method else task.shared
 
 
 def _title(cell: cells.Cell) -> str:

@@ -53,6 +53,13 @@ class Task(NamedTuple):
         return self.method, self.payload, self.mesh, self.seed
 
     @property
+    def shared(self) -> "Task":
+        """The fields on which a suspect depends, where it does not carry the method's own mark; others are empty."""
+        if self.source == UNMARKED:
+            return self._replace(method="", payload=0, limits="", number=0)
+        return self._replace(method="", number=0)
+
+    @property
     def mark(self) -> "Task":
         """The task that makes the mark of the suspect."""
         return self._replace(method=self.source, attack=MARK)
@@ -170,12 +177,12 @@ def _attack_and_read(bench: Bench, task: Task) -> dict[str, Any]:
 
 
 def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
-    """Attack a mesh; an unmarked one is attacked once for all methods."""
+    """Attack a mesh; what all methods read is attacked once."""
     if task.attack == OVERWRITTEN:
         return [_fit(bench, task, before, _SECOND).mesh]
-    if task.source != UNMARKED:
+    if task.source == task.method:
         return line.suspects(before, task.seed)
-    shared = task._replace(method="", payload=0, limits="", number=0)
+    shared = task.shared
     files = [bench.file(shared, copy) for copy in range(line.copies)]
     if not all(file.exists() for file in files):
         for file, suspect in zip(files, line.suspects(before, task.seed), strict=True):

@@ -8,7 +8,7 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, suppress
 from functools import partial
@@ -47,6 +47,7 @@ def run(
     output: str | os.PathLike[str],
     log: Callable[[str], None] = lambda line: None,
     name: Callable[[Cell], str] = lambda cell: "",
+    group: Callable[[Cell], Hashable] = lambda cell: cell,
 ) -> list[dict[str, Any]]:
     """Compute the cells that are not finished, with a new pool whenever one breaks.
 
@@ -60,6 +61,8 @@ def run(
             other cells, too.
         log: callback, called with a line about the progress after each cell.
         name: function that names a cell in such a line.
+        group: function that tells which cells are computed by one worker, one after another, because they have work in
+            common; it returns the same value for each. A killed run loses the cells of a group that is not finished.
 
     Returns:
         The rows of the cells in their order, including those of earlier runs.
@@ -76,14 +79,15 @@ def run(
         count, missing = count or len(left), len(left)
         try:
             with pool() as executor:
-                futures = {executor.submit(work, cell): cell for cell in left}
+                futures = {executor.submit(_work_through, work, some): some for some in _grouped(left, group)}
                 try:
                     for future in as_completed(futures):
-                        append(target, {"cell": futures[future], **future.result()})
-                        broken, missing = 0, missing - 1
-                        pace = (time.monotonic() - start) / (count - missing)
-                        done = f"{len(cells) - missing}/{len(cells)} {name(futures[future])}".rstrip()
-                        log(f"{done}, {left_over(missing * pace)}")
+                        for cell, row in zip(futures[future], future.result(), strict=True):
+                            append(target, {"cell": cell, **row})
+                            broken, missing = 0, missing - 1
+                            pace = (time.monotonic() - start) / (count - missing)
+                            done = f"{len(cells) - missing}/{len(cells)} {name(cell)}".rstrip()
+                            log(f"{done}, {left_over(missing * pace)}")
                 except BaseException:  # also an interruption: cells that have not begun are cancelled
                     executor.shutdown(wait=False, cancel_futures=True)
                     raise
@@ -97,6 +101,17 @@ def run(
             log(f"{error} A new pool continues.")
         rows = _finished_rows(target)
     return [rows[cell] for cell in cells]
+
+
+def _grouped(some: Sequence[Cell], group: Callable[[Cell], Hashable]) -> list[list[Cell]]:
+    groups: dict[Hashable, list[Cell]] = {}
+    for cell in some:
+        groups.setdefault(group(cell), []).append(cell)
+    return list(groups.values())
+
+
+def _work_through(work: Callable[[Cell], Row], some: Sequence[Cell]) -> list[Row]:
+    return [work(cell) for cell in some]
 
 
 def _finished_rows(output: Path) -> dict[Cell, dict[str, Any]]:

@@ -1,6 +1,7 @@
 """Methods of the literature: what they write is what their formulas say, and it reads back."""
 
 from collections.abc import Callable
+from itertools import product
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from jaxmark.bench.methods import builtin_schemes as here
 from jaxmark.bench.methods import influence as spheres
 from jaxmark.bench.methods import moments as patches
 from jaxmark.bench.methods import radial as programme
+from jaxmark.bench.methods import shared
 from jaxmark.bench.methods import vertex_norms as norms
 from jaxmark.bench.methods.primitives import gather, normal, scatter
 from jaxmark.geometry.mesh import Mesh
@@ -164,7 +166,7 @@ def test_presence_alone_is_proved_by_spheres(mesh, key, monkeypatch):
     marked = method.embed(mesh, np.zeros(0, bool), key, 2e-4)
     assert method.read(jm.attack(marked, "noise", 0.003, seed=0), key, mesh).log10_p < -10
     assert method.read(marked, bytes(32), mesh).log10_p > -4
-    monkeypatch.setattr(spheres, "align", nothing_there)
+    monkeypatch.setattr(spheres, "aligned", nothing_there)
     assert method.read(marked, key, mesh).log10_p == 0
     with pytest.raises(jm.JaxmarkError, match="is not blind"):
         method.read(marked, key, None)
@@ -198,6 +200,27 @@ def test_what_no_key_decides_is_looked_at_once(sphere, monkeypatch):
     for choices in (mine, yours):  # a refusal is one for each key
         with pytest.raises(jm.JaxmarkError, match="nothing to look at"):
             scheme.views(other, choices)
+
+
+def test_a_suspect_is_aligned_once_for_all_methods_and_keys(mesh, key, monkeypatch):
+    asked, nothing = [], Mesh(np.array(mesh.vertices) * [1, 1, 0], mesh.faces)
+    align = shared.align
+
+    def counted(original, suspect):
+        asked.append(suspect)
+        if suspect is nothing:
+            raise jm.JaxmarkError("Not aligned.")
+        return align(original, suspect)
+
+    monkeypatch.setattr(shared, "align", counted)
+    methods = [here.keyed(16), spheres.influence(16)]
+    for method, some in product(methods, (key, bytes(32))):
+        method.read(mesh, some, mesh)
+    assert [each is mesh for each in asked] == [True]
+    with pytest.raises(jm.JaxmarkError, match="Not aligned"):
+        methods[0].read(nothing, key, mesh)
+    assert methods[1].read(nothing, key, mesh).log10_p == 0, "a refusal is remembered, too"
+    assert [each is nothing for each in asked] == [False, True]
 
 
 @pytest.mark.slow

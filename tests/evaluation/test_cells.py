@@ -55,6 +55,13 @@ def test_what_is_finished_stays_so(tmp_path):
     assert run(cells, squared, lambda: pytest.fail("a pool"), output) == rows[::-1]
 
 
+def test_cells_of_a_group_are_computed_one_after_another(tmp_path):
+    output, cells = tmp_path / "cells.jsonl", [("a", 1), ("b", 2), ("a", 3), ("b", 4)]
+    rows = run(cells, squared, lambda: ThreadPoolExecutor(1), output, group=lambda cell: cell[0])
+    assert [row["square"] for row in rows] == [1, 4, 9, 16]
+    assert [row["cell"] for row in lines(output)] == [["a", 1], ["a", 3], ["b", 2], ["b", 4]]
+
+
 @pytest.mark.long
 def test_what_goes_wrong_is_raised_and_what_was_finished_stays(tmp_path):
     output = tmp_path / "cells.jsonl"

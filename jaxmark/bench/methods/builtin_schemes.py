@@ -1,6 +1,6 @@
 """The schemes of this library as methods of the benchmark, including two historical schemes, and a public tool's mark.
 
-Non-blind schemes are read from one alignment of the suspect with the original, which all keys share. The message is the
+The message is the
 best guess, whether its tag matches or not. The score is the evidence, -log10 of the bound without its floor. If a
 message is guessed, the score also includes the correlation of the soft decisions with its codeword, from -1 to 1.
 """
@@ -8,17 +8,14 @@ message is guessed, the score also includes the correlation of the soft decision
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import partial
 from itertools import chain, tee
-from typing import Any
 
 import numpy as np
 
-from jaxmark.alignment.attempts import align
-from jaxmark.alignment.original import make_original
-from jaxmark.alignment.result import Alignment
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.harmonics import THRESHOLD, make_mark
+from jaxmark.bench.methods.shared import aligned, once
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.blind.reading import TAG_BITS, codeword, context, read, register
@@ -39,29 +36,6 @@ _OHBUCHI = "Ohbuchi, Takahashi, Miyazawa, Mukaiyama, Watermarking 3D polygonal m
 _SOHN = "Sohn et al., A Digital Watermarking Scheme for Polygonal Meshes using Modified Spectral Decomposition"
 
 
-@dataclass(frozen=True, eq=False)
-class _Identified:
-    """A mesh as the key of a cache: it is identified by its arrays, and keeps them alive."""
-
-    mesh: Mesh
-
-    def __hash__(self) -> int:
-        return hash((id(self.mesh.vertices), id(self.mesh.faces)))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identified) and all(a is b for a, b in zip(self.mesh, other.mesh, strict=True))
-
-
-def _once(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    """Call a function with a cache; meshes are equal if their arrays are identical."""
-    return _cached(make, *(_Identified(value) if isinstance(value, Mesh) else value for value in arguments), **options)
-
-
-@lru_cache(maxsize=12)
-def _cached(make: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-    return make(*(value.mesh if isinstance(value, _Identified) else value for value in arguments), **options)
-
-
 @dataclass(frozen=True)
 class SharedField(FieldScheme):
     """The scheme `field` with views of a suspect that are computed once for all keys, because they depend on no key."""
@@ -70,7 +44,7 @@ class SharedField(FieldScheme):
 
     def views(self, suspect: Mesh, choices: Choices) -> Iterator[list[Look]]:
         """Return the views of a suspect, see `BlindScheme`."""
-        return copy(_once(_views, self, suspect))
+        return copy(once(_views, self, suspect))
 
 
 def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[list[Look]]:
@@ -79,29 +53,25 @@ def _views(scheme: FieldScheme, suspect: Mesh) -> Iterator[list[Look]]:
     return tee(chain([next(looks)], looks), 1)[0]
 
 
-def _align(original: Mesh, suspect: Mesh) -> Alignment:
-    return align(_once(make_original, original), suspect)
-
-
 def _embed(scheme: Scheme, mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-    marker = _once(make_marker, mesh, key, bits=len(message), scheme=scheme)
+    marker = once(make_marker, mesh, key, bits=len(message), scheme=scheme)
     return marker.embed(np.packbits(message).tobytes(), Budget(rms=strength, noise=0), read_back="never")[0]
 
 
 def _embed_blind(scheme: BlindScheme, mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-    marker = _once(make_blind_marker, mesh, key, bits=len(message), scheme=scheme)
+    marker = once(make_blind_marker, mesh, key, bits=len(message), scheme=scheme)
     return marker.embed(np.packbits(message).tobytes(), strength, read_back="never")[0]
 
 
 def _read(scheme: Scheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
-    marker = _once(make_marker, original, key, bits=bits, scheme=scheme)
-    detection = marker.read(_once(_align, original, suspect))
+    marker = once(make_marker, original, key, bits=bits, scheme=scheme)
+    detection = marker.read(aligned(original, suspect))
     return _reading(detection, marker.guess(detection) if bits else None, marker.codeword)
 
 
 def _read_blind(scheme: BlindScheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
     choices = context(Key(key), bits, scheme.name)
-    detection = read(_once(register, suspect), Key(key), bits, scheme)
+    detection = read(once(register, suspect), Key(key), bits, scheme)
     message = detection.message or (guess(detection.scores, bits, TAG_BITS) if bits else None)
     return _reading(detection, message, partial(codeword, choices=choices))
 
@@ -139,10 +109,10 @@ def harmonics(bits: int) -> Method:
     """
 
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-        return _once(make_mark, mesh, key).embed(Bounds(strength, {}))
+        return once(make_mark, mesh, key).embed(Bounds(strength, {}))
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
-        correlation = _once(make_mark, original, key).correlation(suspect, 0.0)
+        correlation = once(make_mark, original, key).correlation(suspect, 0.0)
         return Reading(None, float(np.nan_to_num(correlation)))
 
     source = "Forensic 3D Watermarking Suite, archtecgr"

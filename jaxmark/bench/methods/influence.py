@@ -25,10 +25,10 @@ from jaxtyping import Float64, Int64
 from scipy import sparse, stats
 from scipy.sparse import csgraph
 
-from jaxmark.alignment.attempts import align
-from jaxmark.alignment.original import displace, make_original
+from jaxmark.alignment.original import displace
 from jaxmark.bench.method import Bits, Method, Reading
 from jaxmark.bench.methods.primitives import choices, normal
+from jaxmark.bench.methods.shared import aligned, once, prepared
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, compact, edges, vertex_normals
 
@@ -53,25 +53,25 @@ def influence(bits: int) -> Method:
         return normal(key, "influence", "vector", count), part
 
     def embed(mesh: Mesh, message: Bits, key: bytes, strength: float) -> Mesh:
-        prepared = make_original(mesh)
+        host = prepared(mesh)
         drawn, part = vector(key)
         if bits:
             drawn = np.where(np.asarray(message, bool)[part], drawn, -drawn)
-        shift = np.zeros((len(prepared.used), 3))
-        shift[prepared.used] = (basis(compact(prepared.points), count) @ (strength * drawn)).reshape(-1, 3)
-        return displace(prepared, shift)
+        shift = np.zeros((len(host.used), 3))
+        shift[host.used] = (once(_bumps, mesh, count) @ (strength * drawn)).reshape(-1, 3)
+        return displace(host, shift)
 
     def read(suspect: Mesh, key: bytes, original: Mesh | None = None) -> Reading:
         if original is None:
             raise JaxmarkError("The method influence is not blind; give the original.")
-        prepared = make_original(original)
+        host = prepared(original)
         try:
-            alignment = align(prepared, suspect)
+            alignment = aligned(original, suspect)
         except JaxmarkError:  # the suspect cannot be registered to the original
             return Reading(None, 0.0, 0.0)
-        used = prepared.used
-        affine = np.column_stack([prepared.positions[used], np.ones(used.sum())])  # displacements by affine maps
-        columns = [basis(compact(prepared.points), count), sparse.kron(sparse.csr_array(affine), np.eye(3))]
+        used = host.used
+        affine = np.column_stack([host.positions[used], np.ones(used.sum())])  # displacements by affine maps
+        columns = [once(_bumps, original, count), sparse.kron(sparse.csr_array(affine), np.eye(3))]
         directions = None if alignment.normals is None else alignment.normals[used]
         drawn, part = vector(key)
         bumps = sparse.csr_array(sparse.hstack(columns))
@@ -84,6 +84,10 @@ def influence(bits: int) -> Method:
         return Reading(correlation > 0, total, float(stats.chi2.logsf(total, np.count_nonzero(length))) / math.log(10))
 
     return Method("influence", embed, read, False, bits, (1e-6, 0.1), SOURCE)
+
+
+def _bumps(original: Mesh, count: int) -> Basis:
+    return basis(compact(prepared(original).points), count)
 
 
 def basis(mesh: Mesh, count: int) -> Basis:
