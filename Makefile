@@ -76,7 +76,7 @@ pictures: $(VENV)/.all $(NOTEBOOKS)  ## the pictures of README, front page and g
 looks: $(VENV)/.all  ## the pictures of docs/results/visibility.md, of meshes that are not in the project: make looks MESHES=folder
 	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
-benchmark: $(VENV)/.all  ## the published benchmark of methods anew, some hours: docs/results/benchmark*
+benchmark: $(VENV)/.all  ## the published benchmark of methods anew, about an hour: docs/results/benchmark*
 	$(BIN)/jaxmark bench-corpus build/benchmark/meshes --most-vertices 3000
 	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track smi2010 \
 	  --others $(OTHERS:%=build/benchmark/meshes/%.ply) --keys 1 --output build/benchmark/table
@@ -87,7 +87,7 @@ benchmark: $(VENV)/.all  ## the published benchmark of methods anew, some hours:
 	cp build/benchmark/table/results.md docs/results/benchmark_2026.md
 	tail -n +2 build/benchmark/table/readings.csv >> docs/results/benchmark.csv
 
-benchmark-quick: $(VENV)/.all  ## a part of the published benchmark of methods again, within ten minutes, and where it disagrees
+benchmark-quick: $(VENV)/.all  ## a part of the published benchmark of methods again, within five minutes, and where it disagrees
 	$(BIN)/jaxmark bench-corpus build/benchmark/meshes --most-vertices 3000
 	$(BIN)/jaxmark bench $(QUICK:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track smi2010 2026 \
 	  --limits perceptual hidden --attacks none $(QUICK_ATTACKS) --keys 1 --output build/benchmark/quick --against docs/results/benchmark.csv
