@@ -1,4 +1,4 @@
-"""What readings have in common: it depends on no key, so it is computed once for all methods, keys and messages."""
+"""Results that all methods, keys and messages share, because they depend on no key: each is computed once."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
