@@ -76,7 +76,7 @@ pictures: $(VENV)/.all $(NOTEBOOKS)  ## the pictures of README, front page and g
 looks: $(VENV)/.all  ## the pictures of docs/results/visibility.md, of meshes that are not in the project: make looks MESHES=folder
 	$(BIN)/python benchmarks/pictures/looks.py $(addprefix $(MESHES)/,$(PICTURED)) --levels fandisk_6475 bunny_oded_3301
 
-benchmark: $(VENV)/.all  ## the published benchmark of methods anew, about an hour: docs/results/benchmark*
+benchmark: $(VENV)/.all  ## the published benchmark of methods anew, half an hour on two cores: docs/results/benchmark*
 	$(BIN)/jaxmark bench-corpus build/benchmark/meshes --most-vertices 3000
 	$(BIN)/jaxmark bench $(TABLED:%=build/benchmark/meshes/%.ply) --methods $(METHODS) --track smi2010 \
 	  --others $(OTHERS:%=build/benchmark/meshes/%.ply) --keys 1 --output build/benchmark/table
