@@ -135,9 +135,8 @@ def _suspects(task: Task, track: Track, methods: Sequence[str], keys: int) -> It
 
 
 def _suspect_of(cell: cells.Cell) -> Task:
-    """Return what the readings of one suspect share; it is aligned once for all methods and keys."""
-    task = Task(*cell)  # pyright: ignore[reportArgumentType] (see `run_task`)
-    return task if task.source == task.method else task.shared
+    """Return the suspect of a cell, which is aligned once for all methods and keys."""
+    return Task(*cell).suspect  # pyright: ignore[reportArgumentType] (see `run_task`)
 
 
 def _title(cell: cells.Cell) -> str:

@@ -53,8 +53,15 @@ class Task(NamedTuple):
         return self.method, self.payload, self.mesh, self.seed
 
     @property
-    def shared(self) -> "Task":
-        """The fields on which a suspect depends, where it does not carry the method's own mark; others are empty."""
+    def own(self) -> bool:
+        """Whether the suspect has the mark of the method that reads it."""
+        return self.source == self.method
+
+    @property
+    def suspect(self) -> "Task":
+        """The fields on which the suspect depends; others are empty, so that methods and keys share it."""
+        if self.own:
+            return self
         if self.source == UNMARKED:
             return self._replace(method="", payload=0, limits="", number=0)
         return self._replace(method="", number=0)
@@ -166,8 +173,8 @@ def _attack_and_read(bench: Bench, task: Task) -> dict[str, Any]:
         suspects = _suspects(bench, task, line, before)
     except (Exception, SystemExit) as error:  # also exceptions of a method that overwrites its own mark
         return {"note": f"Not attacked: {_sentence(error)}", "readings": []}
-    seconds, costs, own = time.perf_counter() - start, {}, task.source == task.method
-    if own and line.in_place:
+    seconds, costs = time.perf_counter() - start, {}
+    if task.own and line.in_place:
         with suppress(JaxmarkError):  # raised for a suspect whose area is 0
             costs = Reference(before).measure(suspects[0], COSTS)
     readings = [
@@ -180,10 +187,9 @@ def _suspects(bench: Bench, task: Task, line: Line, before: Mesh) -> list[Mesh]:
     """Attack a mesh; what all methods read is attacked once."""
     if task.attack == OVERWRITTEN:
         return [_fit(bench, task, before, _SECOND).mesh]
-    if task.source == task.method:
+    if task.own:
         return line.suspects(before, task.seed)
-    shared = task.shared
-    files = [bench.file(shared, copy) for copy in range(line.copies)]
+    files = [bench.file(task.suspect, copy) for copy in range(line.copies)]
     if not all(file.exists() for file in files):
         for file, suspect in zip(files, line.suspects(before, task.seed), strict=True):
             _save(file, suspect)
@@ -194,13 +200,12 @@ def _read(bench: Bench, task: Task, original: Mesh, suspect: Mesh, copy: int) ->
     """Read a suspect with the keys of a task."""
     # A key without a mark is used for one reading only, so that false positives are independent of each other.
     fresh = "/".join((task.track, task.limits, task.source, task.attack, str(copy), str(task.number)))
-    own = task.source == task.method
-    names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if own else [fresh]
+    names = [_OWN] if task.limits and task.source == UNMARKED else [_OWN, fresh] if task.own else [fresh]
     method, suspect = load_method(bench.methods[task.method], task.payload), _read_only(suspect)
     message = draw_mark(method.bits, _OWN, *task.sample)[1]
     for name in names:
         start = time.perf_counter()
-        row = {"copy": copy, "own": own and name == _OWN}
+        row = {"copy": copy, "own": task.own and name == _OWN}
         try:
             reading = method.read(suspect, draw_mark(0, name, *task.sample)[0], None if method.blind else original)
             row |= _compare(reading, message)

@@ -8,8 +8,8 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable, Hashable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from concurrent.futures import BrokenExecutor, Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, suppress
 from functools import partial
 from pathlib import Path
@@ -61,8 +61,8 @@ def run(
             other cells, too.
         log: callback, called with a line about the progress after each cell.
         name: function that names a cell in such a line.
-        group: function that tells which cells are computed by one worker, one after another, because they have work in
-            common; it returns the same value for each. A killed run loses the cells of a group that is not finished.
+        group: function that returns the same value for cells with work in common, which one worker computes one after
+            another. A run that is killed or fails loses the cells of a group that is not finished.
 
     Returns:
         The rows of the cells in their order, including those of earlier runs.
@@ -81,13 +81,12 @@ def run(
             with pool() as executor:
                 futures = {executor.submit(_work_through, work, some): some for some in _grouped(left, group)}
                 try:
-                    for future in as_completed(futures):
-                        for cell, row in zip(futures[future], future.result(), strict=True):
-                            append(target, {"cell": cell, **row})
-                            broken, missing = 0, missing - 1
-                            pace = (time.monotonic() - start) / (count - missing)
-                            done = f"{len(cells) - missing}/{len(cells)} {name(cell)}".rstrip()
-                            log(f"{done}, {left_over(missing * pace)}")
+                    for cell, row in _as_finished(futures):
+                        append(target, {"cell": cell, **row})
+                        broken, missing = 0, missing - 1
+                        pace = (time.monotonic() - start) / (count - missing)
+                        done = f"{len(cells) - missing}/{len(cells)} {name(cell)}".rstrip()
+                        log(f"{done}, {left_over(missing * pace)}")
                 except BaseException:  # also an interruption: cells that have not begun are cancelled
                     executor.shutdown(wait=False, cancel_futures=True)
                     raise
@@ -112,6 +111,11 @@ def _grouped(some: Sequence[Cell], group: Callable[[Cell], Hashable]) -> list[li
 
 def _work_through(work: Callable[[Cell], Row], some: Sequence[Cell]) -> list[Row]:
     return [work(cell) for cell in some]
+
+
+def _as_finished(futures: Mapping[Future[list[Row]], Sequence[Cell]]) -> Iterator[tuple[Cell, Row]]:
+    for future in as_completed(futures):
+        yield from zip(futures[future], future.result(), strict=True)
 
 
 def _finished_rows(output: Path) -> dict[Cell, dict[str, Any]]:

@@ -1,8 +1,8 @@
 """The schemes of this library as methods of the benchmark, including two historical schemes, and a public tool's mark.
 
-The message is the
-best guess, whether its tag matches or not. The score is the evidence, -log10 of the bound without its floor. If a
-message is guessed, the score also includes the correlation of the soft decisions with its codeword, from -1 to 1.
+The message is the best guess, whether its tag matches or not. The score is the evidence, -log10 of the bound without
+its floor. If a message is guessed, the score also includes the correlation of the soft decisions with its codeword,
+from -1 to 1.
 """
 
 from collections.abc import Callable, Iterator
