@@ -36,14 +36,17 @@ def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     start, end, apex = faces.T.ravel(), np.roll(faces, -1, axis=1).T.ravel(), np.roll(faces, -2, axis=1).T.ravel()
     # A face whose corners coincide has no sides, only an edge that it runs along twice.
     whole = (start != end) & (end != apex) & (apex != start)
-    start, end, apex = start[whole], end[whole], apex[whole]
-    which = np.searchsorted(pairs @ [base, 1], np.minimum(start, end) * base + np.maximum(start, end))
-    count = np.bincount(which, minlength=len(pairs))
-    order = np.lexsort((start > end, which))  # the face that has the edge in its own direction comes first
-    first, inner = np.cumsum(count) - count, count == 2
-    left, right = pairs[:, 0].copy(), pairs[:, 0].copy()
-    left[inner], right[inner] = apex[order][first[inner]], apex[order][first[inner] + 1]
-    return Hinges(pairs.astype(np.int32), left.astype(np.int32), right.astype(np.int32), inner.astype(float))
+    if not whole.all():
+        start, end, apex = start[whole], end[whole], apex[whole]
+    code = np.minimum(start, end) * base + np.maximum(start, end)
+    order = np.argsort(2 * code + (start > end), kind="stable")  # first the face that has the edge in its own direction
+    code, apex = code[order], apex[order]
+    first = np.flatnonzero(np.diff(code, prepend=-1))
+    first = first[np.diff(first, append=len(code)) == 2]
+    place = np.searchsorted(pairs @ [base, 1], code[first])
+    left, right, inner = pairs[:, 0].astype(np.int32), pairs[:, 0].astype(np.int32), np.zeros(len(pairs))
+    left[place], right[place], inner[place] = apex[first], apex[first + 1], 1
+    return Hinges(pairs.astype(np.int32), left, right, inner)
 
 
 def dihedral_sine_cosine(x: Positions, hinges: Hinges) -> tuple[Float[Array, " edges"], Float[Array, " edges"]]:

@@ -34,7 +34,7 @@ Series = Float[Array | np.ndarray, "*filters terms"]
 Bank = Float[Array | np.ndarray, "bands terms"]
 
 _MIN_ALIGNED = 2**16  # vertices from which on a fourth column pays on a GPU, by measurement
-_BANDS_AT_ONCE = 5  # band components that are formed together where each is used only once
+_VALUES_AT_ONCE = 40  # values per vertex of band components that are formed together
 
 
 def filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, " vertices *columns"]:
@@ -118,8 +118,10 @@ def over_bands(
     The function maps one component, in the shape of `x`, to an array or a tuple of arrays, which are stacked along a
     leading axis of bands. Eager calls compile once for each function object, so define it outside of loops.
     """
-    c = _check_bands(coefficients)
-    groups = jnp.pad(c, ((0, -len(c) % _BANDS_AT_ONCE), (0, 0))).reshape(-1, _BANDS_AT_ONCE, c.shape[1])
+    c, x = _check_bands(coefficients), jnp.asarray(x)
+    most = max(_VALUES_AT_ONCE * len(x) // max(x.size, 1), 1)
+    at_once = -(-len(c) // -(-len(c) // most))  # groups of nearly equal size
+    groups = jnp.pad(c, ((0, -len(c) % at_once), (0, 0))).reshape(-1, at_once, c.shape[1])
 
     @jax.checkpoint
     def over_group(group: Array) -> Any:

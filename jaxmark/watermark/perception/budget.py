@@ -138,7 +138,7 @@ class Budget:
 
     def bounds_of(self, original: Original) -> Bounds:
         """Return the bounds for an original, whose limits by visibility are determined once."""
-        return self._bounds(lambda: original.derived(_visibility))
+        return self._bounds(lambda: _visibility(original.derived(_mean_edge_of)))
 
     def _bounds(self, visibility: Callable[[], Mapping[Visibility, Mapping[str, float]]]) -> Bounds:
         is_hidden = self.rms is None and self.limits is None and self.visibility is None
@@ -178,29 +178,35 @@ def visibility_of(mesh: Mesh) -> Mapping[Visibility, Mapping[str, float]]:
     diagonal, by a factor of at most 2.5, to 0.02 for `hidden`. The limit of shading does not change.
     `docs/visibility.md` has pictures.
     """
-    if not len(mesh.faces):
+    return _visibility(_mean_edge(mesh))
+
+
+def _visibility(mean_edge: float | None) -> Mapping[Visibility, Mapping[str, float]]:
+    if mean_edge is None:
         return CLOUD_VISIBILITY
-    factor = min(max(_mean_edge(mesh) / _FACET, 1.0), _MOST_OF_FACETS)
+    factor = min(max(mean_edge / _FACET, 1.0), _MOST_OF_FACETS)
     return {name: {**limits, "dame": round(factor * limits["dame"], 4)} for name, limits in VISIBILITY.items()}
-
-
-def _visibility(original: Original) -> Mapping[Visibility, Mapping[str, float]]:
-    return visibility_of(original.mesh)
 
 
 def first_rms(mesh: Mesh) -> float:
     """Return the RMS displacement, in diagonals, that is tried first if limits determine the displacement."""
-    return _FIRST_OF_EDGES * _mean_edge(mesh) if len(mesh.faces) else _FIRST_OF_CLOUDS
+    return _first_rms(_mean_edge(mesh))
 
 
-def _first_rms(original: Original) -> float:
-    return first_rms(original.mesh)
+def _first_rms(mean_edge: float | None) -> float:
+    return _FIRST_OF_CLOUDS if mean_edge is None else _FIRST_OF_EDGES * mean_edge
 
 
-def _mean_edge(mesh: Mesh) -> float:
-    """Compute the mean length of an edge over the diagonal."""
+def _mean_edge(mesh: Mesh) -> float | None:
+    """Compute the mean length of an edge over the diagonal; None for a point cloud, which has no edges."""
+    if not len(mesh.faces):
+        return None
     points, pairs = np.asarray(mesh.vertices, np.float64), edges(mesh.faces)
     return float(np.linalg.norm(points[pairs[:, 1]] - points[pairs[:, 0]], axis=1).mean()) / diagonal(mesh)
+
+
+def _mean_edge_of(original: Original) -> float | None:
+    return _mean_edge(original.mesh)
 
 
 def reference_of(original: Original) -> distortion.Reference:
@@ -254,7 +260,7 @@ def displace_within(
 
     rms = largest = bounds.rms or _MAX_RMS
     if bounds.limits:
-        first = first or original.derived(_first_rms)
+        first = first or _first_rms(original.derived(_mean_edge_of))
         # Metrics of single edges are fast. Usually they determine the displacement, and the others are measured once.
         for metrics in dict.fromkeys(
             (tuple(metric for metric in bounds.limits if metric in LOCAL), tuple(bounds.limits))
@@ -278,7 +284,7 @@ def displace_within(
     if abs(reached.rms - rms) > 0.01 * rms:
         raise JaxmarkError(f"A budget of {rms:g} is lost in the rounding of this mesh's coordinates; use a larger one.")
     note = ""
-    if rms in measured and rms < _FAR_LESS * original.derived(_first_rms):
+    if rms in measured and rms < _FAR_LESS * _first_rms(original.derived(_mean_edge_of)):
         metric = worst(measured[rms])
         if faces := _outlying_faces(original.mesh, marked):
             note = (

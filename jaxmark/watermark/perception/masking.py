@@ -4,8 +4,10 @@ Displacements along planes, cylinders and edges are less visible than across the
 shade, so that their displacements are scaled by their spacing.
 """
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Future
+from functools import partial
 from threading import Thread
 from typing import TypeVar
 
@@ -18,7 +20,7 @@ from scipy import sparse
 from jaxmark.alignment.original import Original
 from jaxmark.distortion import Masking, make_masking
 from jaxmark.geometry.clouds import spacings
-from jaxmark.geometry.mesh import Mesh, area, face_normals, open_sides, unit
+from jaxmark.geometry.mesh import Mesh, area, cross_product, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import pad_rows
@@ -35,14 +37,21 @@ _AVERAGING_SCALE = 2  # these angles are averaged over 2^2 steps of diffusion
 _SPACING_POINTS = 8  # number of nearest points whose mean distance is the spacing of a cloud
 _LEAST_SPACING, _MOST_SPACING = 0.25, 2.0  # limits on the spacing, over the median
 _ROWS_AT_ONCE = 2**20
-_ENTRIES = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))  # entries of symmetric matrices that are stored
+_ROWS_IN_THREAD = 2**14  # least number of matrices for which a thread is started
+_ENTRIES = np.triu_indices(3)  # rows and columns of the entries of symmetric matrices that are stored
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # index of each entry of a matrix among them
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
 def masking_tensors(original: Original) -> Float[Array, "rows 3 3"]:
     """Return the tensors of `masking_directions` for traced code; they are computed once for each original."""
-    return original.to_traced(original.derived(masking_directions))
+    return original.derived(_traced_tensors)
+
+
+def _traced_tensors(original: Original) -> Float[Array, "rows 3 3"]:
+    tensors = masking_directions(original)
+    with jax.ensure_compile_time_eval():  # what is kept must not belong to a trace
+        return original.to_traced(tensors)
 
 
 def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
@@ -72,27 +81,26 @@ def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     mesh, size = Mesh(points, faces), len(points)
     # Carriers may be made in traced code; in another thread, nothing is traced. The rest, in NumPy, takes as long.
     heights = _in_thread(lambda: _heights(mesh))
-    normals, angles, opened = face_normals(mesh), _corner_angles(points, faces), open_sides(faces)
+    (normals, angles), opened = _normals_and_angles(points, faces), open_sides(faces)
     along, free = _along_edges(original)
     shares, height, least = heights.result()
     proper = np.flatnonzero(shares)
-    form, weight = _sums(faces[proper], angles[proper], _squares(normals[proper], height[proper]), size)
+    form, weight = _sums(faces[proper], angles[proper], normals[proper] / height[proper, None], size)
 
     # A border is treated as the edge of a solid sheet: as if a wall stood on it.
     face, side = np.nonzero(opened & (shares > 0)[:, None])
     ends = np.stack([faces[face, side], faces[face, (side + 1) % 3]], axis=1)
     outward = unit(np.cross(points[ends[:, 1]] - points[ends[:, 0]], normals[face]))
-    border_form, border_weight = _sums(ends, np.full(ends.shape, np.pi / 2), _squares(outward, least[face]), size)
+    border_form, border_weight = _sums(ends, np.full(ends.shape, np.pi / 2), outward / least[face, None], size)
     weight += border_weight
-    form = (form + border_form) / np.where(weight > 0, weight, 1)[:, None, None]
+    form += border_form
+    form /= np.where(weight > 0, weight, 1)[:, None]
     form[free] += along
-    form[~free] = np.eye(3)
 
     # The displacements whose form is at most 1 are the ellipsoid.
-    values, vectors = np.linalg.eigh(form)
-    matrices = (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
-    matrices[~free] = 0
-    return matrices / np.sqrt(np.mean(np.sum(matrices[original.used] ** 2, axis=(1, 2))) / 3)
+    matrices = np.zeros((size, 3, 3))
+    matrices[free] = _inverse_roots(form[free])
+    return matrices / np.sqrt(np.sum(matrices**2) / np.count_nonzero(original.used) / 3)
 
 
 def _in_thread(compute: Callable[[], Result]) -> "Future[Result]":
@@ -113,7 +121,7 @@ def _in_thread(compute: Callable[[], Result]) -> "Future[Result]":
     return future
 
 
-def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 3 3"], Bool[np.ndarray, " points"]]:
+def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 6"], Bool[np.ndarray, " points"]]:
     """Compute quadratic forms that limit displacements along each edge, and in all directions, by edge lengths.
 
     Edges count as at most twice as long as the median, because a mark that is mostly in a few points gives little
@@ -127,11 +135,11 @@ def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 3 3"], B
     pairs = pairs[pairs[:, 0] < size]  # without padding
     ends = points[pairs[:, 1]] - points[pairs[:, 0]]
     lengths = np.linalg.norm(ends, axis=1)
-    along, count = _sums(pairs, np.ones(pairs.shape), _squares(unit(ends), _ALONG * lengths), size)
+    along, count = _sums(pairs, np.ones(pairs.shape), ends / (_ALONG * lengths**2)[:, None], size)
     mean = np.bincount(pairs.ravel(), np.repeat(lengths, 2), size) / np.maximum(count, 1)
     free = original.used & (count > 0)
     limit = _ALONG * np.minimum(mean, 2 * np.median(mean[free])) if free.any() else mean
-    return along[free] / count[free, None, None] + np.eye(3) / limit[free, None, None] ** 2, free
+    return along[free] / count[free, None] + np.eye(3)[_ENTRIES] / limit[free, None] ** 2, free
 
 
 def _heights(
@@ -147,13 +155,15 @@ def _heights(
     return shares, edge * np.maximum(np.minimum(threshold - unmasked, bends), lowest) / _SLOPE, edge * lowest / _SLOPE
 
 
-def _corner_angles(
+def _normals_and_angles(
     points: Float64[np.ndarray, "points 3"], faces: Int[np.ndarray, "faces 3"]
-) -> Float64[np.ndarray, "faces 3"]:
-    """Compute the angles of faces at their corners."""
-    along = [unit(points[faces[:, (k + 1) % 3]] - points[faces[:, k]]) for k in range(3)]
-    cosines = np.stack([-np.einsum("fi,fi->f", along[k], along[k - 1]) for k in range(3)], axis=1)
-    return np.arccos(np.clip(cosines, -1, 1))
+) -> tuple[Float64[np.ndarray, "faces 3"], Float64[np.ndarray, "faces 3"]]:
+    """Compute the unit normals of faces, and the angles at their corners."""
+    sides = [points[faces[:, (k + 1) % 3]] - points[faces[:, k]] for k in range(3)]
+    normals = cross_product(sides[0], sides[1])
+    double = np.sqrt(np.einsum("fi,fi->f", normals, normals))
+    angles = np.stack([np.arctan2(double, -np.einsum("fi,fi->f", sides[k], sides[k - 1])) for k in range(3)], axis=1)
+    return normals / np.where(double > 0, double, 1)[:, None], angles
 
 
 def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
@@ -173,31 +183,38 @@ def _bends(masking: Masking) -> Float64[np.ndarray, " faces"]:
     return np.exp(np.asarray(filter(masking.links, average, logs), np.float64)[: len(masking.bend)])
 
 
-def _squares(x: Float64[np.ndarray, "rows 3"], size: Float64[np.ndarray, " rows"]) -> Float64[np.ndarray, "rows 6"]:
-    """Compute the entries `_ENTRIES` of forms that are 1 for displacements of the given size along unit vectors."""
-    scaled = x / size[:, None]
-    entries = np.empty((len(x), 6))
-    for place, (i, j) in enumerate(_ENTRIES):
-        entries[:, place] = scaled[:, i] * scaled[:, j]
-    return entries
-
-
 def _sums(
     points: Int[np.ndarray, "rows corners"],
     weights: Float64[np.ndarray, "rows corners"],
-    forms: Float64[np.ndarray, "rows 6"],
+    vectors: Float64[np.ndarray, "rows 3"],
     size: int,
-) -> tuple[Float64[np.ndarray, "points 3 3"], Float64[np.ndarray, " points"]]:
-    """Compute weighted sums of the rows' forms at the points of each row, and the sums of the weights."""
+) -> tuple[Float64[np.ndarray, "points 6"], Float64[np.ndarray, " points"]]:
+    """Sum up the forms x ↦ (vector · x)² of the rows at the points of each row, with weights, and the weights.
+
+    Forms are symmetric matrices, by their entries `_ENTRIES`.
+    """
     sums, total = np.zeros((size, 6)), np.zeros(size)
     for start in range(0, len(points), _ROWS_AT_ONCE):  # in parts, to limit the memory for large meshes
-        corners, corner_weights = (rows[start : start + _ROWS_AT_ONCE] for rows in (points, weights))
+        corners, corner_weights, some = (rows[start : start + _ROWS_AT_ONCE] for rows in (points, weights, vectors))
         # The rows of a CSC matrix's columns need not be sorted.
         starts = np.arange(0, corners.size + 1, corners.shape[1])
         incidence = sparse.csc_array((corner_weights.ravel(), corners.ravel(), starts), shape=(size, len(corners)))
-        sums += incidence @ forms[start : start + _ROWS_AT_ONCE]
+        sums += incidence @ np.stack([some[:, i] * some[:, j] for i, j in zip(*_ENTRIES, strict=True)], axis=1)
         total += np.bincount(corners.ravel(), corner_weights.ravel(), size)
-    return sums[:, _PLACES], total
+    return sums, total
+
+
+def _inverse_roots(forms: Float64[np.ndarray, "rows 6"]) -> Float64[np.ndarray, "rows 3 3"]:
+    """Compute A^-1/2 of symmetric positive matrices, which are given by their entries `_ENTRIES`."""
+
+    def roots(some: Float64[np.ndarray, "some 6"]) -> Float64[np.ndarray, "some 3 3"]:
+        values, vectors = np.linalg.eigh(some[:, _PLACES])
+        return (vectors / np.sqrt(values)[:, None, :]) @ vectors.transpose(0, 2, 1)
+
+    # NumPy finds eigenvectors on one processor.
+    count = min(os.cpu_count() or 1, 1 + len(forms) // _ROWS_IN_THREAD)
+    found = [_in_thread(partial(roots, some)) for some in np.array_split(forms, count)]
+    return np.concatenate([part.result() for part in found])
 
 
 def apply_mask(
