@@ -117,10 +117,11 @@ def survival_text(survives: Survival) -> str:
     """Describe the noise that a mark survives."""
     if math.isinf(survives.whole):
         return "an unknown amount of noise, because this scheme has no noise model"
-    whole, half = (f"{100 * noise:.2g} %" if noise else "none" for noise in survives)
     if not survives.whole:
         return "hardly any noise, only attacks that do not displace vertices"
-    return f"noise of {whole} of the mean distance to the centre, {half} with half of the vertices lost"
+    whole, half = (f"{100 * noise:.2g} %" for noise in survives)
+    text = f"noise of {whole} of the mean distance to the centre"
+    return f"{text}, {half} with half of the vertices lost" if survives.half else f"{text} where no part is lost"
 
 
 def detection_status(detection: Detection, alpha: float) -> Status:
@@ -151,10 +152,12 @@ def detection_lines(
             f"false-positive probability about {power(detection.log10_p)}, an estimate: {'; '.join(evidence.caveats)}"
         )
     else:
-        text += (
-            f"false-positive probability at most {power(detection.log10_p)} if {detection.premises} were fixed"
-            f" before the suspect existed, {power(evidence.log10_p_uncommitted)} even if they were chosen afterwards"
-        )
+        text += f"false-positive probability at most {power(detection.log10_p)}"
+        if detection.log10_p < 0:  # otherwise the bound is 1, whatever was fixed
+            text += (
+                f" if {detection.premises} were fixed before the suspect existed,"
+                f" {power(evidence.log10_p_uncommitted)} even if they were chosen afterwards"
+            )
         if timestamped is not None:
             text += f", {power(timestamped.log10_p)} if the commitment is older than the suspect"
     notes = detection.notes

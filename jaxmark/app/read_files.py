@@ -20,6 +20,7 @@ from jaxmark.files.programs import release_programs
 from jaxmark.files.typed import find_name
 from jaxmark.geometry.mesh import Mesh, digest
 from jaxmark.watermark.blind.reading import best_of, try_each
+from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import EQUALS_ANOTHER, alternatives, detect_scene, read_blind, with_blind
 from jaxmark.watermark.evidence import ledger
@@ -27,7 +28,7 @@ from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.nonblind import Alternatives, Charges
 from jaxmark.watermark.record import Record, SceneRecord, TimestampedCommitment, load_record
-from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME
+from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, USUAL_BLIND_SCHEMES
 
 
 @dataclass
@@ -197,11 +198,7 @@ class FileReader:
         if not self.meshes and len(names) < len(readable):
             note = f"Only the {len(names)} largest of {len(readable)} meshes were read; select others by --mesh."
             best = best._replace(notes=(*best.notes, note))
-        if record is None and best.message is None:
-            note = (
-                "If the suspect is a part, or has more than the marked mesh, give the record: marks of `field` are then"
-                " read only with its hint."
-            )
+        if detection_status(best, self.alpha) is Status.NOTHING and (note := _other_reading(record, schemes)):
             best = best._replace(notes=(*best.notes, note))
         parts = [best_of(found, ledger.PARTS, tries) for found in each.values() if found]
         return self._count_proving(best, parts, len(names)) if several else best
@@ -261,6 +258,19 @@ class FileReader:
                 raise
             self._last = place, marks
         return self._last[1]
+
+
+def _other_reading(record: Record | SceneRecord | None, schemes: Sequence[BlindScheme]) -> str:
+    """Say which reading may find a mark where a blind one of a record, or of some schemes, found none; "" if none."""
+    if record is not None:
+        return "Only the mark of the record was looked for; without the record, other blind marks of the key are, too."
+    hinted = [scheme.name for scheme in schemes or USUAL_BLIND_SCHEMES if "hint" in scheme.remembered]
+    if not hinted:
+        return ""
+    return (
+        "If the suspect is a part, or has more than the marked mesh, give the record: marks of"
+        f" {' and '.join(map(repr, hinted))} are then read only with its hint."
+    )
 
 
 def _distinct(names: Sequence[str], meshes: Mapping[str, Mesh]) -> list[str]:

@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -83,3 +84,32 @@ def test_meshes_that_are_too_small_are_refused_unread(tmp_path: Path, read: list
     with pytest.raises(jm.JaxmarkError, match="needs a mesh of 100 points or more, and there is none; give --original"):
         detection(file_of(tmp_path, [40]))
     assert read == [100]
+
+
+@pytest.mark.parametrize(
+    ("schemes", "has_record", "advice"),
+    [
+        ((), False, "marks of 'field' are then read only with its hint"),
+        (("field",), False, "marks of 'field' are then read only with its hint"),
+        (("rooted",), False, None),
+        ((), True, "Only the mark of the record was looked for"),
+    ],
+)
+def test_where_nothing_was_found_another_reading_is_advised(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    schemes: tuple[str, ...],
+    has_record: bool,
+    advice: str | None,
+):
+    """With a record, the reading without it, and the reverse, but only where it may find more."""
+    nothing = Detection(None, Evidence(), None, np.zeros(1), None, "field")
+    entry = SimpleNamespace(scheme="field", digest=lambda: "0")
+    record = SimpleNamespace(meshes={"": entry}, **vars(entry))
+    monkeypatch.setattr(read_files, "read_blind", lambda *_, **__: nothing)
+    monkeypatch.setattr(read_files, "load_record", lambda _: record)
+    monkeypatch.setattr(read_files, "detection_values", lambda detection, *_: {"notes": detection.notes})
+    reader = read_files.FileReader(KEY, 64, None, schemes=schemes)
+    notes = reader.read(file_of(tmp_path, [100]), None, tmp_path if has_record else None).values["notes"]
+    assert len(notes) == (advice is not None)
+    assert advice is None or advice in notes[0]

@@ -162,13 +162,13 @@ def read(
 
 
 def _note_on_poses(count: int) -> str:
-    """Say whether the hint of a record gave poses of a suspect in which nothing was detected."""
+    """Say in how many poses of a suspect, in which nothing was detected, landmarks of a record's hint fit."""
     if count == 0:
         return "The record's hint gives no pose of this suspect: too few landmarks of the original are found on it."
     tried = "one pose" if count == 1 else f"{count} poses"
     return (
-        f"The record's hint gives {tried} of this suspect, but what is read there does not prove the mark. If the"
-        " record may be of another mesh, read without it."
+        f"Landmarks of the record's hint fit the suspect in {tried}, as some do on any mesh, but what is read there"
+        " does not prove the mark."
     )
 
 

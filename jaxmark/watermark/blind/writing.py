@@ -223,6 +223,11 @@ class Writer:
             JaxmarkError: if it has not.
         """
         most = max(host.size for host in self.hosts.values())
+        if not most:
+            raise JaxmarkError(
+                f"This mesh has no anchors for the scheme {self.scheme.name!r}: it is too small, too smooth or too"
+                " coarse. Use the scheme 'keyed'."
+            )
         if bits and most < bits + TAG_BITS:
             raise JaxmarkError(
                 f"This mesh has at most {most} anchors for the scheme {self.scheme.name!r}, and each carries at most"

@@ -223,7 +223,7 @@ def test_a_part_has_no_mark_that_was_not_made(shape: Mesh, marked, key: jm.Key):
     part = jm.attack(shape, "cropping", 0.3, seed=0)
     found = jm.detect(part, key=key, record=info.record, message=MESSAGE)
     assert found.log10_p > -2
-    assert [note for note in found.notes if note.startswith("The record's hint gives")]
+    assert [note for note in found.notes if note.startswith("Landmarks of the record's hint fit")]
     without = dataclasses.replace(SCHEME.fixed(WIDTH, info.record.parameters["step"]), hint="")
     part = jm.attack(mesh, "cropping", 0.3, seed=0)
     assert reading.read(reading.register(part), key, 32, without, MESSAGE).log10_p > -2
