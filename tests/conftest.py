@@ -26,7 +26,6 @@ jax.config.update(
 
 def pytest_collection_finish() -> None:
     """Look for garbage more rarely: tracing makes many objects, few of which are garbage."""
-    gc.freeze()
     gc.set_threshold(200_000, 20, 20)
 
 

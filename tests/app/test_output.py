@@ -47,7 +47,7 @@ def test_a_bound_of_one_has_no_conditions(log10_p: float, end: str):
     [
         (
             Survival(0.03, 0.02),
-            "noise of 3 % of the mean distance to the centre, 2.1 % with half of the vertices lost",
+            "noise of 3 % of the mean distance to the centre, 2 % with half of the vertices lost",
         ),
         (Survival(0.03, 0.0), "noise of 3 % of the mean distance to the centre where no part is lost"),
         (Survival(0.0, 0.0), "hardly any noise, only attacks that do not displace vertices"),
