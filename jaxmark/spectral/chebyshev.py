@@ -34,7 +34,7 @@ Series = Float[Array | np.ndarray, "*filters terms"]
 Bank = Float[Array | np.ndarray, "bands terms"]
 
 _MIN_ALIGNED = 2**16  # vertices from which on a fourth column pays on a GPU, by measurement
-_VALUES_AT_ONCE = 40  # values per vertex of band components that are formed together
+_VALUES_AT_ONCE = 60  # values per vertex of band components that are formed together
 
 
 def filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, " vertices *columns"]:

@@ -276,7 +276,7 @@ def test_memory_does_not_grow_with_the_degree():
 
 def test_band_by_band_is_the_same_as_all_at_once(operator, dtype):
     """Also where the last group of bands is not full."""
-    bands = random_array(17, DEGREE + 1).astype(dtype)
+    bands = random_array(21, DEGREE + 1).astype(dtype)
     x = jnp.asarray(random_array(len(operator.degree), 3, seed=1).astype(dtype))
     every = chebyshev.band_components(operator, bands, x)
     sums, squares = chebyshev.over_bands(lambda y: (y.sum(axis=0), jnp.sum(y**2)), operator, bands, x)
@@ -295,7 +295,7 @@ def test_memory_does_not_grow_with_the_bands():
 
         return jax.jit(energies).lower(x).compile().memory_analysis().temp_size_in_bytes
 
-    assert scratch(104) < 1.1 * scratch(13)
+    assert scratch(160) < 1.1 * scratch(20)
 
 
 def test_derivative_of_moments(operator, x64):

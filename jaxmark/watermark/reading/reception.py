@@ -8,7 +8,6 @@ attack's effect on the host in that band.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -21,7 +20,7 @@ from jaxmark.alignment.observation import Observation
 from jaxmark.seeds import probe_signs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter, gram, over_bands
-from jaxmark.spectral.laplacian import Laplacian
+from jaxmark.spectral.laplacian import Laplacian, per_row
 from jaxmark.spectral.precision import check_precision, einsum, matmul
 
 # A filter that averages over about a hundred points: sixteen steps, each of which goes halfway to the neighbours' mean.
@@ -260,15 +259,13 @@ def _measure(
 
     # Unobserved points of the host are assumed to have moved with the nuisance, because a hole would leak into every
     # band. The host's bands differ by orders of magnitude, which moments cannot resolve, so each band is filtered.
-    mass = receiver.operator.mass
+    mass = per_row(receiver.operator.mass, residual)
 
-    def products(pair: Float[Array, "vertices 2"]) -> tuple[Array, Array]:
-        return jnp.sum(mass * pair[:, 1] * pair[:, 0]), jnp.sum(mass * pair[:, 1] ** 2)
+    def products(pair: Float[Array, "vertices 6"]) -> tuple[Array, Array]:
+        return jnp.sum(mass * pair[:, 3:] * pair[:, :3]), jnp.sum(mass * pair[:, 3:] ** 2)
 
-    # One coordinate at a time, with more bands at once: the recurrence of all coordinates would run as often.
-    pairs = jnp.stack([residual + nuisance, receiver.signal], axis=2).transpose(1, 0, 2)
-    energies = partial(over_bands, products, receiver.operator, receiver.coefficients)
-    change, whole = (sums.sum(axis=0) for sums in jax.lax.map(energies, pairs))
+    pair = jnp.concatenate([residual + nuisance, receiver.signal], axis=1)
+    change, whole = over_bands(products, receiver.operator, receiver.coefficients, pair)
     gain = 1 + jnp.where(whole > 0, change / jnp.where(whole > 0, whole, 1), 0)
     axes = _axes(filter(receiver.operator, whitening(receiver, power), residual), observation)
     return matmul(residual, axes), jnp.clip(gain, 0, 2), power, axes
