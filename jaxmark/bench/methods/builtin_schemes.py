@@ -64,6 +64,7 @@ def _embed_blind(scheme: BlindScheme, mesh: Mesh, message: Bits, key: bytes, str
 
 
 def _read(scheme: Scheme, bits: int, suspect: Mesh, key: bytes, original: Mesh | None) -> Reading:
+    assert original is not None, "readers that are not blind are given the original"
     marker = once(make_marker, original, key, bits=bits, scheme=scheme)
     detection = marker.read(aligned(original, suspect))
     return _reading(detection, marker.guess(detection) if bits else None, marker.codeword)
