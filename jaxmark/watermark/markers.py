@@ -380,6 +380,8 @@ class BlindMarker:
 
     def read(self, registered: Mesh, message: bytes | None = None) -> Detection:
         """See `Marker`, and `jaxmark.watermark.blind.reading.read`."""
+        if message is not None:
+            check_size(message, self.bits)
         return blind_reading.read(registered, self.key, self.bits, self.scheme, message)
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:

@@ -52,10 +52,10 @@ class Phases(NamedTuple):
     step: float
     change: Float64[np.ndarray, " changes"]
     pilot: float  # fit of the offsets, see `Found`
-    soft: Float64[np.ndarray, " code"]  # soft decisions of the code bits
+    soft: Float64[np.ndarray, " code"]  # soft decisions of the code bits, sums of ±c; the largest |c| is 1
     square: float  # Σ c²
     anchors: int  # number of anchors that count
-    reliable: float  # sum of their reliabilities
+    reliable: float  # sum of their reliabilities, in units of c
 
     @property
     def anchored(self) -> "Anchored":
@@ -137,7 +137,7 @@ def read(
     # Without a record, widths and steps that were left out may have been left out after seeing the suspect.
     usual = scheme if record is not None else BLIND_SCHEMES.get(scheme.name, scheme)
     kinds = max(len(one.widths) * len(one.steps) for one in (scheme, usual))
-    looks = kinds * scheme.looks * _CHANGES
+    looks, omitted = kinds * scheme.looks * _CHANGES, kinds / (len(scheme.widths) * len(scheme.steps))
     best = _nothing(scheme, claim, np.zeros(length), Anchored(Pose(np.eye(3), np.zeros(3))))
     tags_compared = 0  # number of messages whose tags were already compared
     poses: set[bytes] = set()  # poses that the hint gave
@@ -147,7 +147,7 @@ def read(
         if not readings:
             continue
         readings += _readings_again(readings, scheme, choices, length)
-        detection = _weigh(readings, scheme, claim, looks, tags_compared)
+        detection = _weigh(readings, scheme, claim, looks, tags_compared, omitted)
         tags_compared += len(readings) * _CANDIDATES
         best = min(
             best,
@@ -239,8 +239,12 @@ def _readings(view: Look, scheme: BlindScheme, choices: Choices, length: int) ->
             for change, pilot in ((np.zeros(len(view.spread)), 0.0), (changes[turn, rung], float(pilots[turn, rung]))):
                 cosines = np.cos(2 * np.pi * (moved(view, change)[counted] / step - offsets[turn, counted]))
                 cosine = np.bincount(group, reliable * cosines) / alike
+                # Relative to the largest, no square underflows that counts: the norm would be too small for the sum.
+                peak = float(np.abs(cosine).max(initial=0)) or 1.0
+                cosine /= peak
                 soft, square = np.bincount(dither.slot, dither.sign * cosine, length), float(cosine @ cosine)
-                readings.append(Phases(view, turn, float(step), change, pilot, soft, square, len(cosine), total))
+                found = Phases(view, turn, float(step), change, pilot, soft, square, len(cosine), total / peak)
+                readings.append(found)
     return readings
 
 
@@ -269,8 +273,13 @@ class _Claim(NamedTuple):
     record: Record | None
 
 
-def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks: int, before: int) -> Detection:
-    """Compute the evidence of readings, among `looks` possible ones, after `before` tags were compared."""
+def _weigh(
+    readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks: int, before: int, omitted: float
+) -> Detection:
+    """Compute the evidence of readings, among `looks` possible ones, after `before` tags were compared.
+
+    Tags are charged `omitted` times, as if those of omitted widths and steps had been compared before.
+    """
     readings = sorted(readings, key=lambda reading: -reading.pilot)
     soft = np.stack([reading.soft for reading in readings])
     choices, bits, claimed, record = claim
@@ -297,7 +306,7 @@ def _weigh(readings: Sequence[Phases], scheme: BlindScheme, claim: _Claim, looks
         charges = (ledger.BLIND_MESSAGE.charge("claimed or recorded" if fixed else "another"),)
     tag = None
     if decoded is not None and claimed is None:
-        tag = Tag(TAG_BITS, (ledger.RANK.charge("each", before + decoded.rank),))
+        tag = Tag(TAG_BITS, (ledger.RANK.charge("each", math.ceil(omitted * (before + decoded.rank))),))
     ways = [(score[chosen], norm[chosen])]
     reading = readings[chosen]
     notes = []

@@ -89,9 +89,10 @@ def log10_p_fingerprint(
     Returns:
         Numbers of at most 0, `[scores]`; all are 0 if all values are 0.
     """
-    norm = np.linalg.norm(values)
-    if norm == 0:
+    peak = np.abs(values).max(initial=0)
+    if peak == 0:
         return np.zeros(len(score))
+    norm = peak * np.linalg.norm(values / peak)  # squares of the values themselves may underflow
     tilts = _CHERNOFF_THETAS[:, None] * (values / norm / np.sqrt(biases * (1 - biases)))
     logs = np.logaddexp(np.log(biases) + tilts * (1 - biases), np.log1p(-biases) - tilts * biases).sum(1)
     return np.minimum((logs - np.outer(score / norm, _CHERNOFF_THETAS)).min(1) / math.log(10), 0.0)

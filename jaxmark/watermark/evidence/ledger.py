@@ -212,7 +212,8 @@ SCENE_ORDER = _order(SCENE)
 PICKED = _each("meshes picked", "2^-k/m for each of the m sets of k meshes that could be picked", SCENE_ORDER)
 SELECTION = Choice("meshes read", (Alternative("all", 0.97, SCENE_ORDER), Alternative("picked", 0.03, PICKED)))
 
-# Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading.
+# Blind reading. The rank of a tag counts the candidates of all readings, because tags are compared reading by reading,
+# and without a record also, in proportion, those of widths and steps that the reader left out.
 LOOKS = _each(
     "view",
     "1/n for each of n combinations of width, quantisation step, undone smoothing or blur, half turn, reflection, unit"

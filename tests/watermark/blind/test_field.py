@@ -538,7 +538,26 @@ def test_a_blind_detection_has_its_claim(monkeypatch, claim, sign, fields):
     view = SimpleNamespace(pose=None, width=WIDTH, undone=0, by_hint=False, mirrored=[False], values=np.zeros(1))
     phases = reading.Phases(view, 0, 1e-3, np.zeros(7), 0.0, word, *[len(word)] * 3)  # pyright: ignore[reportArgumentType]
     claimed = reading._Claim(CHOICES, 32, claim, None)
-    found = reading._weigh([phases], SCHEME, claimed, 1, 0)
+    found = reading._weigh([phases], SCHEME, claimed, 1, 0, 1.0)
     assert (found.message, found.claimed, found.recorded) == fields
     assert found.premises == "key, message and options"
     assert (found.log10_p < -6) == (sign == 1)
+
+
+@pytest.mark.parametrize("omitted", [1.0, 2.5])
+def test_tags_of_omitted_widths_and_steps_are_charged(omitted: float):
+    """They may have been compared before, by whoever left them out."""
+    word = np.sign(np.random.default_rng(0).normal(size=512))
+    word[:480] = reading.codeword(MESSAGE, CHOICES)[:480]
+    view = SimpleNamespace(pose=None, width=WIDTH, undone=0, by_hint=False, mirrored=[False], values=np.zeros(1))
+    phases = reading.Phases(view, 0, 1e-3, np.zeros(7), 0.0, 1e-3 * word, 512, 512, 512.0)  # pyright: ignore
+    claimed = reading._Claim(CHOICES, 32, None, None)
+    found = reading._weigh([phases], SCHEME, claimed, 1, 2, omitted)
+    assert found.message == MESSAGE
+    charges = {charge.choice: charge.log10 for charge in found.evidence.charges}
+    assert charges["tag rank"] == pytest.approx(math.log10(math.ceil(omitted * 3)))
+
+
+def test_a_marker_refuses_claims_of_another_size(shape: Mesh, key: jm.Key):
+    with pytest.raises(jm.JaxmarkError, match="bits"):
+        make_blind_marker(shape, key, bits=32, scheme=SCHEME).detect(shape, bytes(11))

@@ -284,3 +284,16 @@ def test_anchors_that_are_not_reliable_do_not_count(views: tuple[Look, Look]):
         np.testing.assert_allclose(one.soft, other.soft, atol=1e-6)
         assert (one.square, one.reliable) == pytest.approx((other.square, other.reliable))
         assert one.pilot == pytest.approx(other.pilot, abs=1e-4)
+
+
+def test_reliabilities_whose_squares_underflow_have_their_norm(views: tuple[Look, Look]):
+    """Otherwise the sum would have terms that its norm has not, and a suspect could be made so."""
+    half, _ = views
+    step, exponents = 1e-3, np.random.default_rng(0).uniform(0, 3, len(half.good))
+    scheme, choices = FieldScheme(steps=(step,)), reading.context(bytes(32), 8, "field")
+    scores = []
+    for least in (0.0, 371.5):  # reliabilities of exp(-least - exponent), the latter about 1e-162
+        error = step / np.pi * np.sqrt((least + exponents) / 2)
+        unmoved = reading._readings(half._replace(error=error, starts=64), scheme, choices, 64)[0]
+        scores.append(unmoved.soft / np.sqrt(unmoved.square))
+    np.testing.assert_allclose(scores[1], scores[0], rtol=1e-6, atol=1e-12)
