@@ -94,6 +94,8 @@ def test_scores_and_bound_against_all_codewords(key: jm.Key, kind: str):
     order = np.argsort(-found)
     tail = np.cumsum(chances[order])
     bound = 10 ** log10_p_fingerprint(found[order], y, p)
+    tiny = 10 ** log10_p_fingerprint(1e-162 * found[order], 1e-162 * y, p)
+    np.testing.assert_allclose(tiny, bound, rtol=1e-6)  # although squares underflow
     assert (bound >= tail * (1 - 1e-9)).all()
     assert bound[0] == pytest.approx(tail[0], rel=0.01)  # Chernoff's bound is exact at the highest score
     assert (bound < 30 * tail)[found[order] > 0].all()
