@@ -19,7 +19,9 @@ from jaxmark.distortion._compare import metrics_of as metrics_of
 from jaxmark.distortion._compare import name_of as name_of
 from jaxmark.distortion._compare import shading_at_vertices as shading_at_vertices
 from jaxmark.distortion._shading import Masking as Masking
+from jaxmark.distortion._shading import Relief as Relief
 from jaxmark.distortion._shading import make_masking as make_masking
+from jaxmark.distortion._shading import make_relief as make_relief
 from jaxmark.distortion._shading import shading as shading
 from jaxmark.distortion._shading import vertex_means as vertex_means
 from jaxmark.distortion._shading import visible_turn as visible_turn

@@ -1,8 +1,9 @@
 """Compute all metrics of a pair of meshes at once, on the host."""
 
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import Future
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxmark.distortion._shading import Masking, make_masking, shading, vertex_means, visible_turn
-from jaxmark.distortion.dihedral import Hinges, dame, make_hinges
+from jaxmark.distortion.dihedral import Angles, Hinges, dame_from, make_hinges, weighted_angles
 from jaxmark.distortion.geometric import PointPlanes, SurfaceDistance, gl, point_to_plane, stretch, surface_distance
 from jaxmark.distortion.norms import maximum, rms, with_dtype
 from jaxmark.distortion.rendered import flip, ssim
@@ -35,6 +36,7 @@ from jaxmark.geometry.mesh import (
     weld_mesh,
 )
 from jaxmark.spectral.padding import SURFACE_VALENCE, common_edges, common_size, pad_rows
+from jaxmark.spectral.threads import in_thread
 
 Metric = str | Callable[[Mesh, Mesh], float]  # a name in `METRICS` or `RENDERED`, or a function: see `measure`
 
@@ -98,6 +100,14 @@ class Reference:
         self.used = used_vertices(weld_mesh(self.given, self.welded))  # mask of the distinct points
         self.mesh = self.at_unit_size(_distinct(self.given, self.welded), "original")
         self.faces = np.asarray(self.mesh.faces)
+        self._begun: dict[str, Future[Any]] = {}
+
+    def begin(self, metrics: Collection[Metric]) -> None:
+        """Begin to compute, in other threads, what some metrics need of the original, if it takes long."""
+        if "shading" in metrics and not self._begun:
+            hinges = in_thread(self._make_hinges)
+            # One after the other, because both together would need more memory.
+            self._begun = {"hinges": hinges, "masking": in_thread(self._make_masking, after=hinges)}
 
     def at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
         """Move and scale a mesh as the original is moved and scaled to a diagonal of 1."""
@@ -108,17 +118,32 @@ class Reference:
 
     @cached_property
     def hinges(self) -> Hinges:
-        """Padded with edges of no length, so that programs compiled for one mesh serve others."""
+        return self._begun["hinges"].result() if "hinges" in self._begun else self._make_hinges()
+
+    @cached_property
+    def masking(self) -> Masking:
+        return self._begun["masking"].result() if "masking" in self._begun else self._make_masking()
+
+    def _make_hinges(self) -> Hinges:
+        """Find the hinges, padded with edges of no length, so that programs compiled for one mesh serve others."""
         found = make_hinges(self.faces)
         count = common_edges(len(found.edges), common_size(len(self.mesh.vertices)), SURFACE_VALENCE)
         return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
 
     @cached_property
+    def common(self) -> Array:
+        """The positions, padded to a size that many meshes share."""
+        return _common(self.mesh)
+
+    @cached_property
+    def angles(self) -> Angles:
+        return weighted_angles(self.common, self.hinges)
+
+    @cached_property
     def around(self) -> PointPlanes:
         return PointPlanes.of(np.asarray(self.mesh.vertices))
 
-    @cached_property
-    def masking(self) -> Masking:
+    def _make_masking(self) -> Masking:
         return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
@@ -157,9 +182,7 @@ class _Pair:
 
     @cached_property
     def common(self) -> tuple[Array, Array]:
-        """The positions, padded to a size that many meshes share."""
-        count = common_size(len(self.x))
-        return jax.device_put(pad_rows(np.asarray(self.x), count)), jax.device_put(pad_rows(np.asarray(self.y), count))
+        return self.reference.common, _common(self.meshes[1])
 
     @cached_property
     def moved(self) -> DisplacementSize:
@@ -189,7 +212,7 @@ _METRICS: Mapping[str, Callable[[_Pair], float | Array]] = {
     "mrms": lambda pair: pair.surfaces.mrms,
     "hausdorff": lambda pair: pair.surfaces.hausdorff,
     "gl": lambda pair: gl(pair.x, pair.y, edges(pair.faces[0])),
-    "dame": lambda pair: dame(*pair.common, pair.reference.hinges),
+    "dame": lambda pair: dame_from(pair.reference.angles, pair.common[1], pair.reference.hinges),
     "fmpd": lambda pair: fmpd(local_roughness(pair.x, pair.faces[0]), local_roughness(pair.y, pair.faces[1])),
     "msdm": lambda pair: msdm(pair.x, pair.y, msdm_views(*pair.meshes)),
     "msdm2": lambda pair: msdm2(pair.x, pair.y, pair.views),
@@ -284,6 +307,12 @@ def shading_at_vertices(original: Mesh, distorted: Mesh) -> Float[np.ndarray, " 
     points = np.zeros(len(reference.used), np.float32)
     points[reference.used] = vertex_means(visible_turn(pair.x, pair.y, masking), masking, len(pair.x))
     return points[reference.welded.point]
+
+
+def _common(mesh: Mesh) -> Array:
+    """Pad the positions of a mesh to a size that many meshes share."""
+    points = np.asarray(mesh.vertices, np.float32)
+    return jax.device_put(pad_rows(points, common_size(len(points))))
 
 
 def _distinct(mesh: Mesh, welded: Weld) -> Mesh:

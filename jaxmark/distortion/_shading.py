@@ -72,17 +72,28 @@ class Masking(NamedTuple):
     turned: Float[Array | np.ndarray, " faces"]  # -1 for faces that run against their neighbours, otherwise 1
     links: Laplacian  # of the graph of faces that share an edge that is no crease; padded, see `spectral.padding`
     threshold: Float[Array | np.ndarray, "bands faces"]  # normals' just noticeable turn in each band, in radians
-    bare: Float[Array | np.ndarray, "bands faces"]  # the threshold without masking
-    bend: Float[Array | np.ndarray, " faces"]  # second largest angle to a neighbour: 0 on planes and along their edges
 
     def padded(self) -> "Masking":
         """Pad all arrays with faces of area 0 to the size of `links`, so that many meshes have the same shapes."""
         count = len(self.links.degree)
         if len(self.area) == count:
             return self
-        threshold, bare = (pad_rows(np.asarray(values).T, count, 1).T for values in (self.threshold, self.bare))
-        faces, area, bend = (pad_rows(np.asarray(rows), count) for rows in (self.faces, self.area, self.bend))
-        return Masking(faces, area, pad_rows(np.asarray(self.turned), count, 1), self.links, threshold, bare, bend)
+        faces, area = (pad_rows(np.asarray(rows), count) for rows in (self.faces, self.area))
+        turned, threshold = (pad_rows(np.asarray(rows), count, 1) for rows in (self.turned, self.threshold.T))
+        return Masking(faces, area, turned, self.links, threshold.T)
+
+
+class Relief(NamedTuple):
+    """How the faces of an original meet, from `make_relief`."""
+
+    masking: Masking
+    bare: Float[np.ndarray, "bands faces"]  # the threshold without masking
+    pairs: Int[np.ndarray, "pairs 2"]  # faces that share an edge with no other face
+    angle: Float[np.ndarray, " pairs"]  # between their normals
+
+    def bend(self) -> Float[np.ndarray, " faces"]:
+        """Find the second largest angle of each face to a neighbour: 0 on planes and along their edges."""
+        return _second_largest(self.pairs, self.angle, len(self.masking.faces))
 
 
 def make_masking(
@@ -92,6 +103,13 @@ def make_masking(
 
     Edges of one face, or of three or more faces, are no links.
     """
+    return make_relief(vertices, faces, bands).masking
+
+
+def make_relief(
+    vertices: Float[Array | np.ndarray, "vertices 3"], faces: Int[Array | np.ndarray, "faces 3"], bands: int
+) -> Relief:
+    """Compute the masking as `make_masking` does, and more on how faces meet."""
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces)
     pairs, against = face_pairs(faces)
     area, normals = _areas_and_normals(vertices, faces)
@@ -112,8 +130,8 @@ def make_masking(
     # On small meshes, all bands take less time than compiling a program for fewer.
     computed = BANDS if padded[0].size < MIN_LARGE_VALUES else bands
     threshold, bare = (np.asarray(values)[:bands, : len(faces)] for values in _hidden(links, *padded, computed))
-    share, bend = area / (area.sum() or 1.0), _second_largest(pairs, angle, len(faces))
-    return Masking(faces.astype(np.int32), share, turned, links, threshold, bare, bend)
+    masking = Masking(faces.astype(np.int32), area / (area.sum() or 1.0), turned, links, threshold)
+    return Relief(masking, bare, pairs, angle)
 
 
 @jax.jit

@@ -29,6 +29,13 @@ class Hinges(NamedTuple):
     inner: Float[Array | np.ndarray, " edges"]  # 1 if the edge has two faces, otherwise 0
 
 
+class Angles(NamedTuple):
+    """What the metric DAME needs of an original; make it with `weighted_angles`."""
+
+    angles: Float[Array, " edges"]  # see `dihedral_angles`
+    weights: Float[Array, " edges"]  # of the changes of these angles in the metric
+
+
 def make_hinges(faces: Int[Array | np.ndarray, "faces 3"]) -> Hinges:
     """Find the faces on both sides of each edge, on the host. An edge of one face, or of three or more, is no hinge."""
     faces = np.asarray(faces)
@@ -78,12 +85,24 @@ def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
     ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.
     Edges of faces that are flat in the original, which have no angle there, do not count.
     """
-    before, after = dihedral_angles(original, hinges), dihedral_angles(distorted, hinges)
-    masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (before / np.pi) ** 2)
-    inner = jnp.where(_is_flat(original, hinges), 0, jnp.asarray(hinges.inner).astype(before.dtype))
-    change = jnp.abs(after - before)
+    return dame_from(weighted_angles(original, hinges), distorted, hinges)
+
+
+@jax.jit
+def weighted_angles(original: Positions, hinges: Hinges) -> Angles:
+    """Compute what `dame_from` needs of an original, once for any number of distorted meshes."""
+    angles = dihedral_angles(original, hinges)
+    masking = jnp.exp(math.log(_FOLDED_WEIGHT) * (angles / np.pi) ** 2)
+    inner = jnp.where(_is_flat(original, hinges), 0, jnp.asarray(hinges.inner).astype(angles.dtype))
+    return Angles(angles, inner * masking / jnp.maximum(inner.sum(), 1))
+
+
+@jax.jit
+def dame_from(original: Angles, distorted: Positions, hinges: Hinges) -> Scalar:
+    """Compute the dihedral angle mesh error from the angles of the original; see `dame`."""
+    change = jnp.abs(dihedral_angles(distorted, hinges) - original.angles)
     change = jnp.minimum(change, 2 * np.pi - change)  # two sides of a sheet are folded by π and by -π alike
-    return jnp.sum(inner * masking * change) / jnp.maximum(inner.sum(), 1)
+    return jnp.sum(original.weights * change)
 
 
 def flat_faces(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 
 from jaxmark.geometry.canonical import Canonical, mix, rounded
-from jaxmark.geometry.mesh import Mesh, host_mesh, used_vertices, weld
+from jaxmark.geometry.mesh import Mesh, cross_product, host_mesh, used_vertices, weld
 from jaxmark.geometry.pose import IDENTITY, Points, Pose, similarity
 
 _NEAR, _WIDE = (0.0, 1.0), (-1.0, 0.0, 1.0, 2.0)  # planes of the grid about a coordinate, from the one below
@@ -103,13 +103,13 @@ def _moments(mesh: Mesh) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray,
         points = vertices[weld(vertices).first]
         middle = points.mean(axis=0)
         return middle, (points - middle).T @ (points - middle) / len(points)
-    corners = np.asarray(mesh.vertices)[np.asarray(mesh.faces)]
-    start = corners[0, 0]  # keeps the digits of a mesh that is far from the origin
-    a, b, c = np.moveaxis(corners - start, 1, 0)
-    weight = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    vertices, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces)
+    start = vertices[faces[0, 0]]  # keeps the digits of a mesh that is far from the origin
+    a, b, c = (vertices[faces[:, corner]] - start for corner in range(3))
+    normals, total = cross_product(b - a, c - a), a + b + c
+    weight = np.sqrt(np.einsum("fi,fi->f", normals, normals))
     weight /= max(weight.sum(), 1e-300)
-    middle = weight @ (a + b + c) / 3
-    parts = (a + b + c, a, b, c)
+    middle, parts = weight @ total / 3, (total, a, b, c)
     return start + middle, sum((part.T * weight) @ part for part in parts) / 12 - np.outer(middle, middle)
 
 

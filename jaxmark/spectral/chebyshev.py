@@ -153,15 +153,19 @@ def band_energies(
     v: Float[Array, "vertices columns"],
 ) -> Float[Array, " bands"]:
     """Compute ⟨u, f_j(Δ)v⟩ of each band, with mass over its mean as weights; of unit noise, the bands' dimensions."""
-    return matmul(coefficients, energy_moments(operator, u, v, degree=coefficients.shape[1] - 1))
+    products = cross_moments(operator, u, v, degree=coefficients.shape[1] - 1).sum(axis=1)
+    return matmul(coefficients, products / _mean_mass(operator, u))
 
 
-def energy_moments(
-    operator: Laplacian, u: Float[Array, "vertices columns"], v: Float[Array, "vertices columns"], *, degree: int
-) -> Float[Array, " terms"]:
-    """Compute ⟨u, T_k(Δ̃)v⟩ for k = 0 … degree, with mass over its mean as weights, over all columns."""
-    mass = jnp.asarray(operator.mass).astype(u.dtype)
-    return cross_moments(operator, u, v, degree=degree).sum(axis=1) * (jnp.sum(jnp.sign(mass)) / mass.sum())
+def energy_moments(operator: Laplacian, x: Float[Array, "vertices columns"], terms: int) -> Float[Array, " terms"]:
+    """Compute ⟨x, T_k(Δ̃)x⟩ for so many k, with mass over its mean as weights, over all columns; see `moments`."""
+    return moments(operator, x, degree=terms // 2)[:terms].sum(axis=1) / _mean_mass(operator, x)
+
+
+def _mean_mass(operator: Laplacian, like: Array) -> Float[Array, ""]:
+    """Compute the mean mass of the vertices that have one."""
+    mass = jnp.asarray(operator.mass).astype(like.dtype)
+    return mass.sum() / jnp.sum(jnp.sign(mass))
 
 
 @partial(jax.jit, static_argnames="degree")

@@ -301,6 +301,6 @@ def _probe(
     factor = normal_factor(receiver, observation)
     white = signs if normals is None else normals * signs
     remaining = clean(receiver, observation, factor, white)
-    degree = receiver.coefficients.shape[1] - 1
+    terms = receiver.coefficients.shape[1]
     # The two are measured one after the other, so that there is less to compile.
-    return jax.lax.map(lambda x: energy_moments(receiver.operator, x, x, degree=degree), jnp.stack([white, remaining]))
+    return jax.lax.map(lambda x: energy_moments(receiver.operator, x, terms), jnp.stack([white, remaining]))

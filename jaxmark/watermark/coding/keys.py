@@ -123,7 +123,11 @@ class Choices:
     def permutation(self, label: str, count: int) -> Int64[np.ndarray, " count"]:
         """Derive a permutation of 0 … count - 1: the order of `count` 64-bit words; see `derive`."""
         words = np.frombuffer(self.derive(label, 8 * count), "<u8")
-        return np.argsort(words, kind="stable").astype(np.int64)
+        order = np.argsort(words)  # three times as fast as a stable sort, which only equal words need
+        ranked = words[order]
+        if (ranked[1:] == ranked[:-1]).any():
+            order = np.argsort(words, kind="stable")
+        return order.astype(np.int64)
 
 
 def bind(key: bytes, geometry: bytes, fixed: Mapping[str, Any]) -> Choices:

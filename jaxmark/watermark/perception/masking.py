@@ -5,11 +5,7 @@ shade, so that their displacements are scaled by their spacing.
 """
 
 import os
-from collections.abc import Callable
-from concurrent.futures import Future
 from functools import partial
-from threading import Thread
-from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -18,15 +14,15 @@ from jaxtyping import Array, Bool, Float, Float64, Int
 from scipy import sparse
 
 from jaxmark.alignment.original import Original
-from jaxmark.distortion import Masking, make_masking
+from jaxmark.distortion import Relief, make_relief
 from jaxmark.geometry.clouds import spacings
 from jaxmark.geometry.mesh import Mesh, area, cross_product, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import pad_rows
 from jaxmark.spectral.precision import matmul
+from jaxmark.spectral.threads import in_thread
 
-Result = TypeVar("Result")
 _BAND = 2  # band of `Masking`: waves six edges long, of which marks mostly consist
 _SLOPE = 0.9  # largest slope of such a wave, times an edge, over its height
 _ALONG = 0.04  # displacement along the surface, in edges, that counts as much as a just noticeable one across it
@@ -41,6 +37,11 @@ _ROWS_IN_THREAD = 2**14  # least number of matrices for which a thread is starte
 _ENTRIES = np.triu_indices(3)  # rows and columns of the entries of symmetric matrices that are stored
 _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # index of each entry of a matrix among them
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
+
+
+def begin_masking(original: Original) -> None:
+    """Begin to compute the tensors in another thread, while what does not need them is prepared."""
+    original.begin(_traced_tensors)
 
 
 def masking_tensors(original: Original) -> Float[Array, "rows 3 3"]:
@@ -80,7 +81,7 @@ def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
         return _by_spacing(original)
     mesh, size = Mesh(points, faces), len(points)
     # Carriers may be made in traced code; in another thread, nothing is traced. The rest, in NumPy, takes as long.
-    heights = _in_thread(lambda: _heights(mesh))
+    heights = in_thread(lambda: _heights(mesh))
     (normals, angles), opened = _normals_and_angles(points, faces), open_sides(faces)
     along, free = _along_edges(original)
     shares, height, least = heights.result()
@@ -101,24 +102,6 @@ def masking_directions(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     matrices = np.zeros((size, 3, 3))
     matrices[free] = _inverse_roots(form[free])
     return matrices / np.sqrt(np.sum(matrices**2) / np.count_nonzero(original.used) / 3)
-
-
-def _in_thread(compute: Callable[[], Result]) -> "Future[Result]":
-    """Compute in another thread, where nothing is traced; in this one, if the interpreter is shutting down."""
-    future: Future[Result] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(compute())
-        except BaseException as error:
-            future.set_exception(error)
-
-    try:
-        Thread(target=run).start()
-    except RuntimeError:
-        with jax.ensure_compile_time_eval():
-            run()
-    return future
 
 
 def _along_edges(original: Original) -> tuple[Float64[np.ndarray, "free 6"], Bool[np.ndarray, " points"]]:
@@ -146,10 +129,10 @@ def _heights(
     mesh: Mesh,
 ) -> tuple[Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"], Float64[np.ndarray, " faces"]]:
     """Compute each face's share of the area, the height of a wave that it masks, and the least such height."""
-    masking = make_masking(mesh.vertices, mesh.faces, _BAND + 1)
-    bends = _bends(masking)
-    shares = np.asarray(masking.area)
-    unmasked, threshold = masking.bare[_BAND], masking.threshold[_BAND]
+    found = make_relief(mesh.vertices, mesh.faces, _BAND + 1)
+    bends = _bends(found)
+    shares = np.asarray(found.masking.area)
+    unmasked, threshold = found.bare[_BAND], np.asarray(found.masking.threshold[_BAND])
     edge = np.sqrt(4 / np.sqrt(3) * shares * area(mesh))  # edge of an equilateral triangle of the same area
     lowest = _MIN_HIDDEN * unmasked
     return shares, edge * np.maximum(np.minimum(threshold - unmasked, bends), lowest) / _SLOPE, edge * lowest / _SLOPE
@@ -171,16 +154,17 @@ def _by_spacing(original: Original) -> Float64[np.ndarray, "points 3 3"]:
     spacing = spacings(original.positions, _SPACING_POINTS)
     spacing = np.clip(spacing / (np.median(spacing) or 1.0), _LEAST_SPACING, _MOST_SPACING)
     average = diffusion(_SPACING_SCALE + 1, 2**_SPACING_SCALE + 1)[_SPACING_SCALE]
-    smooth = _in_thread(lambda: original.to_host(filter(original.operator, average, original.to_traced(spacing))))
+    smooth = in_thread(lambda: original.to_host(filter(original.operator, average, original.to_traced(spacing))))
     factor = smooth.result()
     return (factor / np.sqrt(np.mean(factor**2)))[:, None, None] * np.eye(3)
 
 
-def _bends(masking: Masking) -> Float64[np.ndarray, " faces"]:
+def _bends(found: Relief) -> Float64[np.ndarray, " faces"]:
     """Compute the largest rotation that each face masks by its angle to neighbours, as a geometric mean around it."""
-    logs = pad_rows(np.log(np.maximum(masking.bend**2 / _BENT, _LEAST_BEND)), len(masking.links.degree))
+    links, bend = found.masking.links, found.bend()
+    logs = pad_rows(np.log(np.maximum(bend**2 / _BENT, _LEAST_BEND)), len(links.degree))
     average = diffusion(_AVERAGING_SCALE + 1, 2**_AVERAGING_SCALE + 1)[_AVERAGING_SCALE]
-    return np.exp(np.asarray(filter(masking.links, average, logs), np.float64)[: len(masking.bend)])
+    return np.exp(np.asarray(filter(links, average, logs), np.float64)[: len(bend)])
 
 
 def _sums(
@@ -213,7 +197,7 @@ def _inverse_roots(forms: Float64[np.ndarray, "rows 6"]) -> Float64[np.ndarray, 
 
     # NumPy finds eigenvectors on one processor.
     count = min(os.cpu_count() or 1, 1 + len(forms) // _ROWS_IN_THREAD)
-    found = [_in_thread(partial(roots, some)) for some in np.array_split(forms, count)]
+    found = [in_thread(partial(roots, some)) for some in np.array_split(forms, count)]
     return np.concatenate([part.result() for part in found])
 
 

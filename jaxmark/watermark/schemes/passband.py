@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from jaxmark.watermark.evidence.ledger import MIN_LOG10_P
 from jaxmark.watermark.interfaces import Scheme
-from jaxmark.watermark.perception.budget import Bounds
+from jaxmark.watermark.perception.budget import Bounds, reference_of
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 
@@ -47,6 +47,7 @@ def choose_pass_band(usual: Capacity, bits: int, bounds: Bounds, noise: float = 
     original, best = usual.original, usual.scheme
     if best != KeyedScheme() or not bounds.limits:
         return best
+    reference_of(original).begin(bounds.limits)
     reached = usual.estimate_reach(bits, bounds, usual.needed(bits, _PLENTY, noise))
     most = usual.evidence(bits, reached, noise) * (1 + 1e-6)  # the factor allows for rounding
     for other in candidates(best)[1:]:
