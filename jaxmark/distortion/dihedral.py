@@ -30,7 +30,7 @@ class Hinges(NamedTuple):
 
 
 class Angles(NamedTuple):
-    """What the metric DAME needs of an original; make it with `weighted_angles`."""
+    """The dihedral angles of an original, as the metric DAME needs them; made by `weighted_angles`."""
 
     angles: Float[Array, " edges"]  # see `dihedral_angles`
     weights: Float[Array, " edges"]  # of the changes of these angles in the metric
