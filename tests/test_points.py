@@ -166,6 +166,7 @@ def test_marks_survive(steps, method, marker: jm.watermark.NonBlindMarker, marke
     assert found.registration.method == method
 
 
+@pytest.mark.slow
 def test_half_of_a_cloud_in_any_pose_and_order_shows_its_points(marker: jm.watermark.NonBlindMarker, marked: Mesh):
     half = jm.attack(marked, "subsampling", 0.5, seed=2)
     straight, found = (marker.detect(one) for one in (half, anywhere(half)))
@@ -245,6 +246,7 @@ def test_a_cloud_that_was_sampled_anew_is_read_by_its_planes(
     assert found.log10_p < -6
 
 
+@pytest.mark.slow
 def test_what_is_no_copy_is_not_aligned(marker: jm.watermark.NonBlindMarker):
     random = np.random.default_rng(0)
     with pytest.raises(jm.JaxmarkError, match="could not be aligned"):

@@ -45,6 +45,7 @@ def allowed(terms: np.ndarray) -> float:
     return float(np.finfo(terms.dtype).eps) * (abs(math.fsum(exact)) + np.linalg.norm(exact))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", ["rising", "woven", "random"])
 def test_millions_of_terms_against_the_exact_sum(order, dtype):
     terms = rising(COUNT, dtype)

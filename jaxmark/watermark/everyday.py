@@ -251,9 +251,10 @@ def read_blind(
         detections.append(detection)
         if blind_reading.is_sure(detection):
             break
+    if record is not None:  # it names the only scheme
+        return detections[0]
     # Whoever names a scheme may have tried the others before.
-    tries = 1 if record is not None else max(len(BLIND_SCHEMES), len(candidates))
-    return blind_reading.best_of(detections, ledger.BLIND_SCHEME, tries)
+    return blind_reading.best_of(detections, ledger.BLIND_SCHEME, max(len(BLIND_SCHEMES), len(candidates)))
 
 
 def with_blind(

@@ -33,6 +33,7 @@ def along(mesh: Mesh, way: np.ndarray) -> Counted:
     return Counted(lambda suspect: -float(np.sum((suspect.vertices - mesh.vertices) * way)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "strength"), [("jamming", 0.0047), ("noise", 0.017)])
 def test_oracles_say_what_the_detector_says(marked, kind, strength):
     marker, mesh = marked

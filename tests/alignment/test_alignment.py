@@ -273,6 +273,7 @@ def test_what_was_cut_away_is_masked(original: Original):
     check_pose(original, found.pose, pose, 5e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_a_surface_shows_displacement_along_its_normals(seed, original: Original):
     """The same surface in twice as many triangles; its edges are straight, so closest points lie on it."""
@@ -298,6 +299,7 @@ def test_a_surface_shows_displacement_along_its_normals(seed, original: Original
     assert np.std(along) == pytest.approx(np.std(expected), rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [-1, 1], ids=["outside", "inside"])
 def test_a_mirrored_surface_shows_the_same(step, original: Original):
     amount = 2e-3 * np.sin(20 * original.positions[:, 0])
@@ -383,6 +385,7 @@ def test_a_remeshed_part_is_aligned(original: Original):
     check_pose(original, found.pose, pose, 1e-3)
 
 
+@pytest.mark.slow
 def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
     change = np.eye(3) + 0.03 * np.random.default_rng(4).normal(size=(3, 3))
     vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))
@@ -390,6 +393,7 @@ def test_an_affine_map_of_a_surface_is_undone_on_request(original: Original):
     assert align(original, suspect, "affine").residual < 1e-6 < 1e-4 < align(original, suspect).residual
 
 
+@pytest.mark.slow
 def test_smoothing_of_another_meshing_is_noticed():
     original = make_original(bumpy_sphere(4), FINE)
     vertices, faces = trimesh.remesh.subdivide(np.asarray(original.mesh.vertices), np.asarray(original.mesh.faces))

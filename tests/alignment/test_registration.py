@@ -86,6 +86,7 @@ def test_a_similarity_and_an_affine_map_by_least_squares(seed):
     np.testing.assert_allclose(both(points), anywhere(seed + 10)(pose(points)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_the_pose_of_another_meshing_is_found(seed, mesh: Mesh):
     other, pose = finer(mesh), anywhere(seed)

@@ -65,6 +65,7 @@ def test_nothing_is_said_without_a_terminal(workshop: Workshop):
     assert (code, err) == (0, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quiet", [False, True])
 def test_commands_say_what_they_do(workshop: Workshop, monkeypatch, quiet: bool):
     more = ["--quiet"] if quiet else []

@@ -99,6 +99,7 @@ def test_finer_grids_and_deeper_trees_come_nearer(sphere: Mesh):
     assert trees[1] < 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "strength"), USUAL)
 def test_host_function_makes_the_mesh_of_the_points(kind, strength, sphere: Mesh):
     """Copies along a seam and an isolated vertex make no difference, nor do large coordinates; the seed decides."""

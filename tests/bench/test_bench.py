@@ -457,6 +457,7 @@ def test_other_meshes_are_read_in_place_of_each_mesh(small: dict, tmp_path: Path
     assert jm.bench.entries(found)["signs"]["payloads"]["64"]["calibration"]["nulls"]["another mesh"]["trials"] == 3
 
 
+@pytest.mark.slow
 def test_unmarked_suspects_are_made_once_for_all_methods(small: dict):
     made = []
 
@@ -510,6 +511,7 @@ def test_a_reader_that_remembers_what_was_written_is_caught(small: dict):
     assert any("ITS OWN THRESHOLD IS TOO LOW" in said for said in found.verdicts)
 
 
+@pytest.mark.slow
 def test_more_keys_and_other_files_are_measured_anew(small: dict, tmp_path: Path):
     def nulls(keys: int) -> int:
         run = {**small, "meshes": [path], "attacks": ["none"], "keys": keys}

@@ -181,6 +181,7 @@ def test_no_more_than_32_pieces_are_searched():
     assert (len(pieces), left_out.number) == (32, 8)
 
 
+@pytest.mark.slow
 def test_many_pieces_that_resemble_nothing_cost_little_more_than_one(shop: Shop, monkeypatch):
     """Readings, and searches for the poses of parts, are counted; the piece that resembles an original comes first."""
     calls: list[str] = []

@@ -63,6 +63,7 @@ def without_seconds(rows: tuple[Row, ...]) -> list[Row]:
     return [row._replace(seconds=0) for row in rows]
 
 
+@pytest.mark.slow
 def test_rows_are_what_marker_attack_and_detect_say(results):
     mesh, found = bumpy_sphere(3), {(row.attack, row.strength, row.seed, row.control): row for row in results.rows}
     assert len(found) == len(results.rows) == 3 * 2 * 3

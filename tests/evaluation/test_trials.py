@@ -37,6 +37,7 @@ def trial(trials):
     return trials.run(KeyedScheme(profile=(1.0,) * 12))
 
 
+@pytest.mark.slow
 def test_what_is_tried_is_what_the_detector_has(mesh, trials, trial):
     """Keys of our own, a marker each: as much evidence, within what chance makes of so few marks."""
     for place, attack in enumerate(ATTACKS):

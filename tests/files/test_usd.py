@@ -278,6 +278,7 @@ def _square(old: str, new: str) -> Callable[[], bytes]:
     return lambda: layer({"Square": SQUARE.replace(old, new)})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("make", "message"),
     [

@@ -131,6 +131,7 @@ def test_the_completed_bound_3_holds(seed, x64):
     assert np.asarray(correlation_bound(jnp.asarray(sequences), jnp.asarray(attack), 0.9, beta)).max() < 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "noise"), [("keyed", 0.006), pytest.param("host", 5e-4, marks=pytest.mark.slow), ("eigen", 5e-4)]
 )

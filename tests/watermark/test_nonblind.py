@@ -10,6 +10,7 @@ from tests.alignment.test_registration import face, finer
 from tests.samples import bumpy_sphere
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mesh", "count"), [(face(3, 0.0), 2), (bumpy_sphere(3), 1)])
 def test_the_worse_reflection_is_read_only_if_it_fits_nearly_as_well(mesh: Mesh, count: int):
     """Only of a shape that is its own mirror image, up to the mark."""

@@ -285,6 +285,7 @@ def exported(folder: Path, meshes: dict[str, Mesh], name: str) -> Path:
     return folder / name
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("unchecked")
 def test_commands_on_a_file_of_several_meshes(tmp_path, monkeypatch, capfd, originals):
     workshop = Workshop(tmp_path, monkeypatch, capfd)

@@ -125,6 +125,7 @@ def test_values_of_coarse_surfaces_do_not_depend_on_how_they_are_cut(other: str,
     assert change_of_values(coarse, copy._replace(faces=rolled)) < most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("axis", range(7))
 def test_changes_of_pose_are_derivatives(shape: Mesh, axis: int):
     view = next(SCHEME.views(shape, CHOICES))[0]
@@ -316,6 +317,7 @@ def test_refusals(shape: Mesh, marked, key: jm.Key, sphere: Mesh, unchecked):
         jm.detect(shape, key=key, record=record)
 
 
+@pytest.mark.slow
 def test_payloads_that_a_mesh_cannot_hold_are_refused_before_they_are_written(
     shape: Mesh, key: jm.Key, tmp_path: Path, monkeypatch
 ):
@@ -416,6 +418,7 @@ def test_shapes_made_to_be_huge_in_their_pose_are_refused(share: float, said: st
         see(place(with_parts_inside_out(ball, share)).mesh, (WIDTH,), np.dtype(np.float32))
 
 
+@pytest.mark.slow
 def test_a_part_that_one_scheme_refuses_does_not_hide_what_another_proves(shape: Mesh, key: jm.Key):
     marked, _ = jm.embed(shape, MESSAGE, key, budget=2e-3, scheme="local")
     suspect = with_parts_inside_out(marked, 1.1)
@@ -488,6 +491,7 @@ def test_a_limit_that_a_few_faces_make_tight_is_named(thin):
         thin.write(b"", jm.Budget(limits={"dame": 0.001}))
 
 
+@pytest.mark.slow
 def test_a_reading_that_detects_nothing_says_nothing_of_the_pose():
     scheme = FieldScheme(widths=(0.018,), steps=FieldScheme().steps[4:8])
     # A key for which the likeliest view of chance is mirrored and was smoothed.
@@ -496,12 +500,14 @@ def test_a_reading_that_detects_nothing_says_nothing_of_the_pose():
     assert found.notes == ()
 
 
+@pytest.mark.slow
 def test_a_mark_that_does_not_read_back_is_refused_with_the_limit(thin, monkeypatch):
     monkeypatch.setattr(BlindMarker, "reads", lambda *_: False)
     with pytest.raises(jm.JaxmarkError, match=f"does not read back.*{TIGHT}"):
         thin.embed(b"", jm.Budget(limits={"dame": 0.006}))
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_limit(thin, tmp_path, monkeypatch):
     monkeypatch.setattr(mark_files, "prepare", lambda *_, **__: thin)
     monkeypatch.setattr(BlindMarker, "measure_survival", lambda *_, **__: Survival(0.02, 0.01))

@@ -175,6 +175,7 @@ def test_a_suspect_of_any_size_costs_as_much(bumpy: Mesh, hint: Hint):
         assert len(list(hint.poses(other))) == 1
 
 
+@pytest.mark.slow
 def test_hints_of_one_kind_or_place_do_no_harm(rough: Mesh, hint: Hint):
     """Made by an owner who edits a record: a suspect shrinks to no point, and shares no kind with the hint."""
     one = hint.landmarks.pick(np.zeros(50, int))

@@ -48,6 +48,7 @@ def test_fishers_product_is_that_of_chi_square():
         assert log10_p_product(values) == pytest.approx(expected, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_evidence_without_floor_orders_what_the_bound_does_not():
     """Where nothing has reached the floor both are one number; where the bound stands still, the other does not."""
     mesh, key = bumpy_sphere(4), jm.Key(bytes(32))

@@ -100,6 +100,7 @@ def test_the_floor_of_the_key_holds_before_charges_outside_of_a_bound():
     assert figure(0.0, [payload], UNFLOORED) == 0.0
 
 
+@pytest.mark.slow
 def test_paths_are_told_from_what_is_none():
     score, alignment = ledger.PROOF.charge("score", 2), ledger.ALIGNMENT.charge("auto")
     assert is_charged_along_a_path(())

@@ -95,6 +95,7 @@ def test_bits_are_noise_to_each_other():
     assert worth(np.full(3, 10 / 400), dimensions) == pytest.approx(10 / (1 + 10 / 400), rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("direction", ["coordinates", "normals"])
 @pytest.mark.parametrize("passband", ["tapered", "narrow"])
 def test_room_is_what_the_projection_leaves(direction, passband, x64):
@@ -187,6 +188,7 @@ def test_what_carries_a_payload_carries_a_shorter_one():
     assert small.least_budget(8, USUAL) <= small.least_budget(64, USUAL) < math.inf
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("vertices", "bits", "budget"),
     [(2562, 64, 8e-4), (1100, 16, 8e-4), (10242, 256, 8e-4), (10242, 64, 2e-4)],

@@ -72,6 +72,7 @@ def test_vertices_tell_what_closest_points_do_not():
     assert marker.read(aligned(), weights=np.ones(len(SHAPE.vertices))).message is None
 
 
+@pytest.mark.slow
 def test_no_key_takes_part():
     one, other = coarse(3).residual, coarse(5).residual
     np.testing.assert_allclose(other, one, rtol=0, atol=TWICE * np.abs(one).max())

@@ -58,6 +58,7 @@ def test_evidence_is_what_is_predicted(passband):
     assert predicted == pytest.approx(measured, rel=0.2)
 
 
+@pytest.mark.slow
 def test_faint_marks_prove_more_in_the_band_that_is_chosen():
     assert faint().scheme == KeyedScheme(passband="low")
     assert evidence("low", FAINT)[0] > 1.2 * evidence("tapered", FAINT)[0]
@@ -100,6 +101,7 @@ def test_what_is_asked_to_be_survived_decides():
         marker.adapted(jm.Budget(limits=FAINT, noise=-1.0))
 
 
+@pytest.mark.slow
 def test_faint_marks_are_read_with_their_record_and_without():
     key = jm.Key(bytes(range(32)))
     marked, info = jm.embed(SHAPE, b"ab", key, budget=FAINT)

@@ -35,6 +35,7 @@ def test_a_copy_names_its_recipient(tracer: jm.watermark.Tracer, copies: np.ndar
     assert accused(tracer, noisy.vertices @ np.diag([1, 2, 0.5])) == {NAMES[0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [2, 4])
 @pytest.mark.parametrize("kind", ["average", "mix of vertices", "median"])
 def test_colluders_are_found(tracer: jm.watermark.Tracer, copies: np.ndarray, count, kind):
@@ -88,6 +89,7 @@ def test_too_small_a_mesh_is_refused(key: jm.Key):
         jm.fingerprint(tiny, "alice", key)
 
 
+@pytest.mark.slow
 def test_a_copy_names_its_recipient_however_the_name_is_typed(tracer: jm.watermark.Tracer):
     vertices = tracer.fingerprint("A\u030alice ", 8e-4)[0].vertices
     suspect = tracer.mark.original.mesh._replace(vertices=vertices)
