@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any, TypeVar
 
 import jax
@@ -15,7 +14,6 @@ from jaxmark.geometry.canonical import grid_spacing, rounded
 from jaxmark.geometry.mesh import Mesh, Weld, diagonal, displacement, host_mesh, used_vertices
 from jaxmark.spectral.laplacian import Laplacian, centre
 from jaxmark.spectral.padding import common_laplacian, pad_rows
-from jaxmark.spectral.threads import in_thread
 
 Result = TypeVar("Result")
 
@@ -70,20 +68,10 @@ class Original:
     def _derived(self) -> dict[Callable[["Original"], Any], Any]:
         return {}
 
-    @cached_property
-    def _begun(self) -> dict[Callable[["Original"], Any], "Future[Any]"]:
-        return {}
-
-    def begin(self, compute: Callable[["Original"], Any]) -> None:
-        """Begin to compute, in another thread, what `derived` will return for a function."""
-        if compute not in self._derived and compute not in self._begun:
-            self._begun[compute] = in_thread(partial(compute, self))
-
     def derived(self, compute: Callable[["Original"], Result]) -> Result:
         """Return what a function computes from this original alone, on the host; it is called once."""
         if compute not in self._derived:
-            begun = self._begun.pop(compute, None)
-            self._derived[compute] = compute(self) if begun is None else begun.result()
+            self._derived[compute] = compute(self)
         return self._derived[compute]
 
     @cached_property

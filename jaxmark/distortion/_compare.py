@@ -100,14 +100,21 @@ class Reference:
         self.used = used_vertices(weld_mesh(self.given, self.welded))  # mask of the distinct points
         self.mesh = self.at_unit_size(_distinct(self.given, self.welded), "original")
         self.faces = np.asarray(self.mesh.faces)
-        self._begun: dict[str, Future[Any]] = {}
 
     def begin(self, metrics: Collection[Metric]) -> None:
         """Begin to compute, in other threads, what some metrics need of the original, if it takes long."""
-        if "shading" in metrics and not self._begun:
-            hinges = in_thread(self._make_hinges)
+        if "shading" in metrics and "masking" not in {**self._begun, **self.__dict__}:
+            hinges = self._begun["hinges"] = in_thread(self._make_hinges)
             # One after the other, because both together would need more memory.
-            self._begun = {"hinges": hinges, "masking": in_thread(self._make_masking, after=hinges)}
+            self._begun["masking"] = in_thread(self._make_masking, after=hinges)
+
+    @cached_property
+    def _begun(self) -> dict[str, Future[Any]]:
+        return {}
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copy and store a reference without what was begun."""
+        return {name: value for name, value in self.__dict__.items() if name != "_begun"}
 
     def at_unit_size(self, mesh: Mesh, name: str) -> Mesh:
         """Move and scale a mesh as the original is moved and scaled to a diagonal of 1."""
@@ -118,33 +125,39 @@ class Reference:
 
     @cached_property
     def hinges(self) -> Hinges:
-        return self._begun["hinges"].result() if "hinges" in self._begun else self._make_hinges()
+        begun = self._begun.pop("hinges", None)
+        return self._make_hinges() if begun is None else begun.result()
 
     @cached_property
     def masking(self) -> Masking:
-        return self._begun["masking"].result() if "masking" in self._begun else self._make_masking()
+        begun = self._begun.pop("masking", None)
+        return self._make_masking() if begun is None else begun.result()
 
     def _make_hinges(self) -> Hinges:
         """Find the hinges, padded with edges of no length, so that programs compiled for one mesh serve others."""
         found = make_hinges(self.faces)
         count = common_edges(len(found.edges), common_size(len(self.mesh.vertices)), SURFACE_VALENCE)
-        return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
+        with jax.ensure_compile_time_eval():  # what is kept must not belong to a trace
+            return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
 
     @cached_property
     def common(self) -> Array:
         """The positions, padded to a size that many meshes share."""
-        return _common(self.mesh)
+        with jax.ensure_compile_time_eval():
+            return _common(self.mesh)
 
     @cached_property
     def angles(self) -> Angles:
-        return weighted_angles(self.common, self.hinges)
+        with jax.ensure_compile_time_eval():
+            return weighted_angles(self.common, self.hinges)
 
     @cached_property
     def around(self) -> PointPlanes:
         return PointPlanes.of(np.asarray(self.mesh.vertices))
 
     def _make_masking(self) -> Masking:
-        return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
+        with jax.ensure_compile_time_eval():
+            return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
         """Measure how far a mesh was distorted from this original; see `measure`."""

@@ -142,7 +142,7 @@ def visible_turn(original: Positions, distorted: Positions, masking: Masking) ->
     unmoved = jnp.all((original == distorted)[masking.faces], axis=(1, 2))[:, None]
     change -= jax.lax.stop_gradient(jnp.where(unmoved, change, 0))
     padded = jnp.pad(change, ((0, len(masking.links.degree) - len(change)), (0, 0)))
-    energy = jnp.sum(_bands(masking.links, padded, len(masking.threshold))[:, : len(change)] ** 2, axis=2)
+    energy = _energies(masking.links, padded, len(masking.threshold))[:, : len(change)]
     turn = root(energy) / jnp.asarray(masking.threshold).astype(change.dtype)
     largest = jax.lax.stop_gradient(jnp.max(turn, axis=0))
     largest = jnp.where(largest > 0, largest, 1)
@@ -232,12 +232,12 @@ def _diffusions(count: int) -> Float[np.ndarray, "scales terms"]:
     return np.where(np.arange(terms[-1]) < np.array(terms)[:, None], series, 0)
 
 
-def _bands(links: Laplacian, x: Array, count: int) -> Array:
-    """Split signals of faces into bands, starting with the shortest waves; the longest waves are in no band."""
+def _energies(links: Laplacian, x: Array, count: int) -> Array:
+    """Compute the energy of signals of faces in bands, from the shortest waves on; the longest waves are in no band."""
     passed = _diffusions(count)
     bands = _GAINS[:count, None] * (np.vstack([np.eye(1, passed.shape[1]), passed[:-1]]) - passed)
-    parts = [band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands, x.size)]
-    return jnp.concatenate(parts)
+    parts = (band_components(links, jnp.asarray(some, x.dtype), x) for some in _by_length(bands, x.size))
+    return jnp.concatenate([jnp.sum(part**2, axis=2) for part in parts])
 
 
 def _by_length(series: Float[np.ndarray, "series terms"], values: int) -> list[Float[np.ndarray, "some fewer"]]:
@@ -254,7 +254,7 @@ def _by_length(series: Float[np.ndarray, "series terms"], values: int) -> list[F
 @partial(jax.jit, static_argnames="count")
 def _hidden(links: Laplacian, normals: Array, length: Array, count: int) -> tuple[Array, Array]:
     """Compute the just noticeable turns in each band, with and without masking, from the means around each face."""
-    energy, dtype = jnp.sum(_bands(links, normals, count) ** 2, axis=2), normals.dtype
+    energy, dtype = _energies(links, normals, count), normals.dtype
     means, start = [], 0
     for some in _by_length(_diffusions(count), normals.size):
         # Each band's energy and the lengths are averaged by the same series: columns of one signal.

@@ -39,11 +39,6 @@ _PLACES = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])  # index of each entry of 
 _SPACING_SCALE = 5  # spacings are averaged over 2^5 steps of diffusion
 
 
-def begin_masking(original: Original) -> None:
-    """Begin to compute the tensors in another thread, while what does not need them is prepared."""
-    original.begin(_traced_tensors)
-
-
 def masking_tensors(original: Original) -> Float[Array, "rows 3 3"]:
     """Return the tensors of `masking_directions` for traced code; they are computed once for each original."""
     return original.derived(_traced_tensors)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -13,11 +14,12 @@ from jaxmark.alignment.original import Original
 from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh, check_faces, vertex_normals
 from jaxmark.spectral.bands import scaling
+from jaxmark.spectral.threads import in_thread
 from jaxmark.watermark.carriers.chips import KeyedCarrier, make_chips
 from jaxmark.watermark.coding.keys import Choices
 from jaxmark.watermark.coding.message import TAG_BITS, code_length
 from jaxmark.watermark.interfaces import Scheme
-from jaxmark.watermark.perception.masking import begin_masking, masking_tensors
+from jaxmark.watermark.perception.masking import masking_tensors
 from jaxmark.watermark.reading.reception import Host, Receiver, make_host, make_receiver
 
 # Relative strengths of the lowest 20 of 64 bands: the mean over meshes that were tuned to noise, smoothing and
@@ -144,8 +146,7 @@ class KeyedScheme(Scheme):
 
     def carrier(self, original: Original, choices: Choices, bits: int, code_bits: int) -> KeyedCarrier:
         """See `Scheme`."""
-        if self._masks:
-            begin_masking(original)
+        masking = in_thread(partial(self.mask, original))  # takes longer than all else together
         layout, dtype = self.layout(original, bits), original.signal.dtype
         host = host_of(original, self.family()[: layout.passing], layout.scales, layout.degree)
         chips = make_chips(choices, original.chip_places, code_bits, channels=self._channels, count=original.count)
@@ -154,7 +155,7 @@ class KeyedScheme(Scheme):
             check_faces("A mark along normals", original.points)
             normals = vertex_normals(Mesh(original.positions, original.points.faces))
             carrier = carrier._replace(normals=original.to_traced(normals))
-        return carrier._replace(masking=self.mask(original))
+        return carrier._replace(masking=masking.result())
 
     def tunable(self) -> "KeyedScheme":
         """See `Scheme`."""
@@ -168,7 +169,9 @@ class KeyedScheme(Scheme):
 
     def mask(self, original: Original) -> Float[Array, "rows 3 3"] | None:
         """Compute a symmetric matrix `[3, 3]` on each vertex's displacement; None if it is 1 everywhere."""
-        return masking_tensors(original) if self._masks else None
+        if not self.hiding or self.direction != "coordinates":
+            return None
+        return masking_tensors(original)
 
     def receiver(self, original: Original, bits: int) -> Receiver:
         """Make the receiver of marks with a payload size, with all bands of `family`."""
@@ -191,11 +194,6 @@ class KeyedScheme(Scheme):
         if values.ndim != 1 or not len(values):
             raise JaxmarkError(f"A profile is one number for each of the lowest bands, not an array {values.shape}.")
         return replace(self, profile=tuple(values.tolist()))
-
-    @property
-    def _masks(self) -> bool:
-        """Whether displacements are masked."""
-        return self.hiding and self.direction == "coordinates"
 
     @property
     def _channels(self) -> int:
