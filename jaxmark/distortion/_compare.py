@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -125,39 +125,34 @@ class Reference:
 
     @cached_property
     def hinges(self) -> Hinges:
-        begun = self._begun.pop("hinges", None)
-        return self._make_hinges() if begun is None else begun.result()
+        # What is kept must not belong to a trace, and in a thread nothing is traced.
+        return (self._begun.pop("hinges", None) or in_thread(self._make_hinges)).result()
 
     @cached_property
     def masking(self) -> Masking:
-        begun = self._begun.pop("masking", None)
-        return self._make_masking() if begun is None else begun.result()
+        return (self._begun.pop("masking", None) or in_thread(self._make_masking)).result()
 
     def _make_hinges(self) -> Hinges:
         """Find the hinges, padded with edges of no length, so that programs compiled for one mesh serve others."""
         found = make_hinges(self.faces)
         count = common_edges(len(found.edges), common_size(len(self.mesh.vertices)), SURFACE_VALENCE)
-        with jax.ensure_compile_time_eval():  # what is kept must not belong to a trace
-            return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
+        return with_dtype(Hinges(*(pad_rows(np.asarray(rows), count) for rows in found)), jnp.float32)
 
     @cached_property
     def common(self) -> Array:
         """The positions, padded to a size that many meshes share."""
-        with jax.ensure_compile_time_eval():
-            return _common(self.mesh)
+        return in_thread(partial(_common, self.mesh)).result()
 
     @cached_property
     def angles(self) -> Angles:
-        with jax.ensure_compile_time_eval():
-            return weighted_angles(self.common, self.hinges)
+        return in_thread(partial(weighted_angles, self.common, self.hinges)).result()
 
     @cached_property
     def around(self) -> PointPlanes:
         return PointPlanes.of(np.asarray(self.mesh.vertices))
 
     def _make_masking(self) -> Masking:
-        with jax.ensure_compile_time_eval():
-            return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
+        return with_dtype(make_masking(np.asarray(self.mesh.vertices), self.faces).padded(), jnp.float32)
 
     def measure(self, distorted: Mesh, metrics: Collection[Metric]) -> dict[Metric, float | None]:
         """Measure how far a mesh was distorted from this original; see `measure`."""

@@ -18,7 +18,8 @@ def in_thread(compute: Callable[[], Result], after: "Future[object] | None" = No
         after: another computation, which ends first.
     """
     future: Future[Result] = Future()
-    wide, device = jax.config.jax_enable_x64, jax.config.jax_default_device
+    wide = jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     def run() -> None:
         try:
