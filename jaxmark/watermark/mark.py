@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -112,7 +112,7 @@ class Mark:
     @cached_property
     def capacity(self) -> Capacity:
         """The capacity of the original with the scheme."""
-        return Capacity(self.original, self.scheme, {self.bits: lambda: self.reader})
+        return Capacity(self.original, self.scheme, {self.bits: partial(getattr, self, "reader")})
 
     @property
     def order_charges(self) -> tuple[Charge, ...]:

@@ -1,5 +1,6 @@
 import dataclasses
 import math
+import pickle
 from functools import partial
 
 import jax
@@ -262,6 +263,20 @@ def test_a_vertex_thrown_away_is_masked(sphere: Mesh, key: jm.Key):
     found = jm.detect(thrown, original=sphere, key=key)
     assert found.message == MESSAGE
     assert found.coverage == pytest.approx(1 - 1 / len(sphere.vertices))
+
+
+def test_a_used_marker_is_stored_and_writes_the_same(sphere: Mesh, key: jm.Key):
+    marker = jm.make_marker(sphere, key, bits=48, scheme="host")
+    marked, info = marker.embed(b"stored")
+    again, same = pickle.loads(pickle.dumps(marker)).embed(b"stored")
+    np.testing.assert_array_equal(again.vertices, marked.vertices)
+    assert same.record == info.record
+
+
+@pytest.mark.parametrize("name", ["field", "local", "rooted"])
+def test_blind_marks_are_not_read_with_the_original(name, sphere: Mesh, key: jm.Key):
+    with pytest.raises(jm.JaxmarkError, match=f"scheme '{name}' are read without the original: leave it out"):
+        jm.make_marker(sphere, key, scheme=name)
 
 
 def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):

@@ -75,8 +75,9 @@ def get_nonblind(scheme: str | Scheme | BlindScheme) -> Scheme:
         return scheme
     name = name_of(scheme)
     if name not in SCHEMES:
-        kind = "scheme that is read with the original" if name in NAMES else "scheme"
-        raise JaxmarkError(f"There is no {kind} {name!r}; the schemes are {', '.join(NAMES)}.")
+        if name in BLIND_SCHEMES:
+            raise JaxmarkError(f"Marks of the scheme {name!r} are read without the original: leave it out.")
+        raise JaxmarkError(f"There is no scheme {name!r}; the schemes are {', '.join(NAMES)}.")
     return SCHEMES[name]()
 
 
