@@ -15,6 +15,7 @@ from jaxmark.alignment.attempts import align
 from jaxmark.alignment.nearest import find_heights, find_partners
 from jaxmark.alignment.original import make_original
 from jaxmark.app import cli
+from jaxmark.errors import AlignmentError
 from jaxmark.files import number_check
 from jaxmark.geometry.clouds import Cloud, planes, spacings
 from jaxmark.geometry.mesh import Mesh, diagonal, make_mesh, used_vertices
@@ -229,6 +230,23 @@ def test_another_sampling_shows_how_high_its_surface_is():
     error = found.height * outward - expected
     assert np.abs(error.mean()) < 0.02 * expected.mean()
     assert np.sqrt(np.mean(error**2)) < 0.15 * expected.mean()
+
+
+def test_copies_of_points_show_the_same_heights():
+    x, y = Cloud(ball(2000)), 1.01 * ball(3000, 1)
+    expected = find_heights(x, y)
+    for copies in (np.repeat(y, 2, axis=0), np.vstack([y, y[:1600]])):
+        found = find_heights(x, copies)
+        np.testing.assert_allclose(found.height, expected.height, atol=1e-9)
+        np.testing.assert_array_equal(found.known, expected.known)
+
+
+def test_points_that_all_coincide_show_nothing(host: Mesh, marker: jm.watermark.NonBlindMarker):
+    for count in (1, 100):
+        with pytest.raises(AlignmentError, match="at one place"):
+            marker.detect(cloud(np.tile([[0.1, 0.2, 0.3]], (count, 1))))
+    for x, y in ((ball(50), np.zeros((50, 3))), (1e-40 * ball(50), ball(50)), (ball(50), 1e-40 * ball(50))):
+        assert np.isfinite(find_heights(Cloud(x), y).height).all()
 
 
 @pytest.mark.parametrize("turn", [False, pytest.param(True, marks=pytest.mark.slow)])

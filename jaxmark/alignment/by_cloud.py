@@ -37,6 +37,8 @@ def align_cloud(original: Original, suspect: PreparedSuspect, align: Align, refl
         JaxmarkError: if no pose brings the suspect's points near the original's.
     """
     points = np.asarray(suspect.mesh.vertices, np.float64)[used_vertices(suspect.mesh)]
+    if not np.ptp(points, axis=0).any():
+        raise AlignmentError("All points of the suspect are at one place, so that it has no shape to align.")
     if not suspect.is_cloud:
         sampled = Surface(suspect.mesh).sample(_SAMPLES_PER_POINT * int(original.used.sum())).points
         points = np.concatenate([points, sampled])

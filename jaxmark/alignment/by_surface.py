@@ -45,7 +45,7 @@ def align_surfaces(
     """
     surface = Surface(Mesh(original.positions, original.points.faces))
     whole = Surface(suspect.welded)
-    parts = [Surface(part) for part in components(suspect.welded)[:_MAX_COMPONENTS] if area(part) > 0]
+    parts = [Surface(part) for part in components(suspect.welded, _MAX_COMPONENTS) if area(part) > 0]
     parts = parts if len(parts) > 1 else []
     further = [(whole, register_part), *((part, register_whole) for part in parts)] if in_parts else []
     failed: list[Alignment] = []

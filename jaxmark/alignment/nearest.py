@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from scipy.spatial import KDTree
 
 from jaxmark.geometry.clouds import Cloud, planes, spacings
+from jaxmark.geometry.mesh import weld
 from jaxmark.geometry.pose import Points, Pose, similarity
 
 _REACH = 0.8  # largest distance of partners, in units of the local spacing
@@ -23,6 +24,7 @@ _MIN_EXCESS = 1.3  # least ratio of the number of close points to the number tha
 _SEEN = 3.0  # distance, in spacings, within which the suspect covers a point
 _MIN_SURVIVING = 0.01  # least fraction of the original's points that are close, if its own points survive
 _MAX_ROUNDS = 8  # rounds of pairing points and fitting the pose to the pairs
+_MOST_SPARSE = 1e3  # ratio of spacings that counts as the largest
 _FIRST_REACH, _APPROACHES = 8.0, 30  # first reach, in spacings, and number of rounds, of the coarse fit
 _MIN_PAIRS = 10  # least number of pairs to which a pose is fitted
 _PLANE_POINTS = 12  # number of points of the sparser cloud to which a plane is fitted
@@ -115,8 +117,8 @@ def find_heights(x: Cloud, y: Others) -> Heights:
         x: the original's points.
         y: the suspect's points, in the original's pose.
     """
-    other = Cloud(y)
-    ratio = (x.spacing / max(other.spacing, 1e-300)) ** 2
+    other = Cloud(y[weld(y).first])  # copies of a point are no neighbours
+    ratio = min(x.spacing / max(other.spacing, 1e-300), _MOST_SPARSE) ** 2
     count, other_count = (
         int(np.clip(round(_PLANE_POINTS * by), _PLANE_POINTS, _MAX_PLANE_POINTS))
         for by in (1 / max(ratio, 1e-9), ratio)

@@ -73,5 +73,5 @@ def _components(mesh: Mesh) -> list[Mesh]:
         return []
     welded = weld_mesh(mesh, weld(mesh.vertices))
     least = _LEAST_SHARE * area(welded)
-    parts = components(welded)[:_MOST_COMPONENTS]
+    parts = components(welded, _MOST_COMPONENTS)
     return [compact(part) for part in parts if len(part.faces) >= _LEAST_FACES and area(part) >= least]

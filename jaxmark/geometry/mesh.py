@@ -245,12 +245,18 @@ def component_of(mesh: Mesh) -> Int64[np.ndarray, " vertices"]:
     return csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
 
 
-def components(mesh: Mesh) -> list[Mesh]:
-    """Split a mesh into its connected components, the one of most faces first; each keeps all vertices."""
+def components(mesh: Mesh, most: int) -> list[Mesh]:
+    """Split a mesh into its connected components, the one of most faces first; each keeps all vertices.
+
+    Args:
+        mesh: any mesh.
+        most: number of components from which on the others are left out.
+    """
     faces = np.asarray(mesh.faces)
     label = component_of(mesh)[faces[:, 0]]
-    largest = np.argsort(-np.bincount(label), kind="stable")
-    return [mesh._replace(faces=faces[label == number]) for number in largest[: len(np.unique(label))]]
+    count = np.bincount(label)
+    largest = np.argsort(-count, kind="stable")[:most]
+    return [mesh._replace(faces=faces[label == number]) for number in largest if count[number]]
 
 
 def used_vertices(mesh: Mesh) -> Bool[np.ndarray, " vertices"]:

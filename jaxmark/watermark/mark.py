@@ -109,6 +109,10 @@ class Mark:
         """The reader of the carrier; made at its first use."""
         return self.carrier.reader()
 
+    def begin_reading(self) -> None:
+        """Begin to make the reader, which JAX does beside what follows, such as aligning a suspect."""
+        _ = self.reader
+
     @cached_property
     def capacity(self) -> Capacity:
         """The capacity of the original with the scheme."""

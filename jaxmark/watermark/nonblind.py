@@ -66,10 +66,12 @@ class Alternatives(NamedTuple):
         Returns:
             The best detection, and its mark.
         """
+        first = self.first
         if message is not None:
-            check_claim(self.first, message)
+            check_claim(first, message)
+        first.begin_reading()
         readings: list[tuple[Detection, Mark]] = []
-        for reflection_charges, aligned in _registrations(self.first.original, suspect, align):
+        for reflection_charges, aligned in _registrations(first.original, suspect, align):
             for mark_charges, prepare in self.marks:
                 mark = prepare()
                 # A second reading takes seconds, hence only the likeliest alternative gets one.

@@ -98,7 +98,8 @@ def test_components_are_the_connected_parts():
         np.concatenate([ball.vertices, loose, torus.vertices]),
         np.concatenate([ball.faces, np.asarray(torus.faces) + len(ball.vertices) + 1]),
     )
-    first, second = components(both)
+    first, second = components(both, 3)
+    assert len(components(both, 1)) == 1
     assert (len(first.faces), len(second.faces)) == (len(torus.faces), len(ball.faces))
     np.testing.assert_array_equal(second.faces, ball.faces)
     np.testing.assert_array_equal(first.vertices, both.vertices)

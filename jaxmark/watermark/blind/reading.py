@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from jaxmark.errors import JaxmarkError
-from jaxmark.geometry.mesh import Mesh, check_faces, compact, weld, weld_mesh
+from jaxmark.geometry.mesh import Mesh, check_faces, compact, host_mesh, weld, weld_mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.scheme import LOOKS_AGAIN, BlindScheme, Look
@@ -105,8 +105,9 @@ def register(suspect: Mesh) -> Mesh:
     """Weld a suspect and drop vertices that no face uses, as `read` expects it; independent of the key.
 
     Raises:
-        JaxmarkError: if it is a point cloud.
+        JaxmarkError: if it is a point cloud, or no mesh, see `make_mesh`.
     """
+    suspect = host_mesh(suspect)
     check_faces("A mark without an original", suspect)
     return compact(weld_mesh(suspect, weld(suspect.vertices)))
 

@@ -184,6 +184,11 @@ def test_refusals(shape: Mesh, key: jm.Key):
         jm.embed(shape, MESSAGE, key, scheme=("keyed", "local", "local"))
     with pytest.raises(jm.JaxmarkError, match="nothing to write in"):
         jm.embed(shape, MESSAGE, key, budget=1e-7, scheme="local")
+    for faces in ([[0, 1, 5]], [[0, 1, -1]], [[0, 1, 2.5]]):
+        with pytest.raises(jm.JaxmarkError, match=r"[Ff]aces? "):
+            jm.detect(Mesh(np.eye(3), np.array(faces)), key=key)
+    with pytest.raises(jm.JaxmarkError, match=r"array \[N, 3\]"):
+        jm.detect(Mesh(np.zeros((3, 2)), np.array([[0, 1, 2]])), key=key)
 
 
 @pytest.mark.slow
