@@ -103,7 +103,7 @@ class Reference:
 
     def begin(self, metrics: Collection[Metric]) -> None:
         """Begin to compute, in other threads, what some metrics need of the original, if it takes long."""
-        if "shading" in metrics and "masking" not in {**self._begun, **self.__dict__}:
+        if "shading" in metrics and not ("masking" in self._begun or "masking" in self.__dict__):
             hinges = self._begun["hinges"] = in_thread(self._make_hinges)
             # One after the other, because both together would need more memory.
             self._begun["masking"] = in_thread(self._make_masking, after=hinges)
@@ -125,7 +125,7 @@ class Reference:
 
     @cached_property
     def hinges(self) -> Hinges:
-        # What is kept must not belong to a trace, and in a thread nothing is traced.
+        # Other threads trace nothing, so that no tracers are kept.
         return (self._begun.pop("hinges", None) or in_thread(self._make_hinges)).result()
 
     @cached_property

@@ -108,3 +108,11 @@ def test_key_files(tmp_path):
         jm.watermark.load_key(tmp_path / "absent")
     with pytest.raises(JaxmarkError, match="cannot be written"):
         jm.watermark.save_key(key, tmp_path / "no" / "folder.key")
+
+
+def test_equal_words_keep_their_order(monkeypatch):
+    """Else the permutation would depend on the processor that sorts."""
+    words = np.random.default_rng(0).integers(0, 7, 4000).astype("<u8")
+    monkeypatch.setattr(Choices, "derive", lambda *_: words.tobytes())
+    found = Choices(jm.Key(bytes(32)), b"").permutation("slots", len(words))
+    np.testing.assert_array_equal(found, np.lexsort([np.arange(len(words)), words]))
