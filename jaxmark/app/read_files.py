@@ -6,7 +6,6 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
-from jaxmark.alignment.original import Original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align
 from jaxmark.app.diagnosis import diagnose, is_original
@@ -109,9 +108,15 @@ class FileReader:
                     raise JaxmarkError("Several schemes can only be read from one mesh; select it by --mesh.")
                 return self._outcome(self._read_scene(suspect, scene, loaded), suspect, loaded)
             original_mesh, marked = scene.meshes[name], (loaded or scene).meshes
+        # A suspect that cannot be read is refused before the original is prepared, which takes long.
+        meshes = {"": load_mesh(suspect)} if isinstance(loaded, Record) else load_scene(suspect).meshes
         self.doing(f"preparing {original}")
         marks = self._alternatives(original_mesh, original, None if loaded is None else loaded.meshes[name], suspect)
-        mesh = load_mesh(suspect) if isinstance(loaded, Record) else _resembling(suspect, name, marks.first.original)
+        if len(meshes) == 1:
+            (mesh,) = meshes.values()
+        else:
+            chosen = pair({name: marks.first.original.marked_order}, meshes).get(name)
+            mesh = load_mesh(suspect) if chosen is None else meshes[chosen]
         self.doing(f"aligning {suspect} and reading it")
         detection, mark = marks.read(mesh, self.message, align=self.align)
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes[1:]]
@@ -279,13 +284,6 @@ def _distinct(names: Sequence[str], meshes: Mapping[str, Mesh]) -> list[str]:
     for name in names:
         first.setdefault(digest(meshes[name]), name)
     return list(first.values())
-
-
-def _resembling(suspect: Path, name: str, original: Original) -> Mesh:
-    """Return the mesh of a suspect's file that resembles an original; all of the file if there is none."""
-    meshes = load_scene(suspect).meshes
-    other = pair({name: original.marked_order}, meshes).get(name)
-    return load_mesh(suspect) if other is None else meshes[other]
 
 
 def _has_skin(path: Path) -> bool:

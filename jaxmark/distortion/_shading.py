@@ -87,6 +87,7 @@ class Relief(NamedTuple):
     """How the faces of an original meet, from `make_relief`."""
 
     masking: Masking
+    area: float  # of all faces that have a normal
     bare: Float[np.ndarray, "bands faces"]  # the threshold without masking
     pairs: Int[np.ndarray, "pairs 2"]  # faces that share an edge with no other face
     angle: Float[np.ndarray, " pairs"]  # between their normals
@@ -130,8 +131,9 @@ def make_relief(
     # On small meshes, all bands take less time than compiling a program for fewer.
     computed = BANDS if padded[0].size < MIN_LARGE_VALUES else bands
     threshold, bare = (np.asarray(values)[:bands, : len(faces)] for values in _hidden(links, *padded, computed))
-    masking = Masking(faces.astype(np.int32), area / (area.sum() or 1.0), turned, links, threshold)
-    return Relief(masking, bare, pairs, angle)
+    whole = float(area.sum())
+    masking = Masking(faces.astype(np.int32), area / (whole or 1.0), turned, links, threshold)
+    return Relief(masking, whole, bare, pairs, angle)
 
 
 @jax.jit

@@ -113,3 +113,10 @@ def test_where_nothing_was_found_another_reading_is_advised(
     notes = reader.read(file_of(tmp_path, [100]), None, tmp_path if has_record else None).values["notes"]
     assert len(notes) == (advice is not None)
     assert advice is None or advice in notes[0]
+
+
+def test_a_suspect_is_refused_before_the_original_is_prepared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(read_files, "make_marker", lambda *_, **__: pytest.fail("The original was prepared."))
+    reader = read_files.FileReader(KEY, 64, None)
+    with pytest.raises(jm.JaxmarkError, match=r"Cannot read .*missing\.obj"):
+        reader.read(tmp_path / "missing.obj", file_of(tmp_path, [100]))

@@ -16,7 +16,7 @@ from scipy import sparse
 from jaxmark.alignment.original import Original
 from jaxmark.distortion import Relief, make_relief
 from jaxmark.geometry.clouds import spacings
-from jaxmark.geometry.mesh import Mesh, area, cross_product, open_sides, unit
+from jaxmark.geometry.mesh import Mesh, cross_product, open_sides, unit
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import filter
 from jaxmark.spectral.padding import pad_rows
@@ -128,7 +128,7 @@ def _heights(
     bends = _bends(found)
     shares = np.asarray(found.masking.area)
     unmasked, threshold = found.bare[_BAND], np.asarray(found.masking.threshold[_BAND])
-    edge = np.sqrt(4 / np.sqrt(3) * shares * area(mesh))  # edge of an equilateral triangle of the same area
+    edge = np.sqrt(4 / np.sqrt(3) * shares * found.area)  # edge of an equilateral triangle of the same area
     lowest = _MIN_HIDDEN * unmasked
     return shares, edge * np.maximum(np.minimum(threshold - unmasked, bends), lowest) / _SLOPE, edge * lowest / _SLOPE
 
