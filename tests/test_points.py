@@ -403,6 +403,9 @@ def test_laser_scans_keep_all_but_their_positions(suffix: str, tmp_path: Path):
         records = np.ones(len(before), bool)
         records[179:227] = False
         start, size = int.from_bytes(path.read_bytes()[96:100], "little"), scan.header.point_format.size
+        (tmp_path / "cut.las").write_bytes(path.read_bytes()[: -10 * size])
+        with pytest.raises(jm.JaxmarkError, match="header counts 500 points"):
+            jm.load_mesh(tmp_path / "cut.las")
         records[(start + size * np.arange(500)[:, None] + np.arange(12)).ravel()] = False
         np.testing.assert_array_equal(before[records], after[records])
     with pytest.raises(jm.JaxmarkError, match="scale of at most"):

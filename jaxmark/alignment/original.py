@@ -41,6 +41,11 @@ class Original:
     signal: Float[Array, "rows 3"]  # points, centred per connected component, in diagonals, traced
 
     @property
+    def is_whole(self) -> bool:
+        """Whether it has exactly the points of the mesh that was marked; an edited copy has not."""
+        return self.count == np.count_nonzero(self.used) and bool((self.places[self.used] >= 0).all())
+
+    @property
     def density(self) -> float:
         """The spectral density: the number of eigenvalues below a small λ, over λ and the number of points.
 

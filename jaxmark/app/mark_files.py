@@ -223,7 +223,7 @@ def _mark_scene(
                 " with more digits."
             )
         if len(survives) < len(markers):
-            info = _restricted(info, survives)
+            info = _restricted(info, survives, key)
             notes = save_scene({name: meshes[name] for name in survives}, pair.file, like=original)
         write_atomically(pair.record, info.record.to_json().encode())
     each = {
@@ -254,12 +254,12 @@ def _mark_scene(
     return FileOutcome(values, (text, *_unchanged(skipped), *noted, *notes))
 
 
-def _restricted(info: SceneInfo, names: Collection[str]) -> SceneInfo:
+def _restricted(info: SceneInfo, names: Collection[str], key: Key) -> SceneInfo:
     """Leave out the marks of all other meshes, which cannot be read from the file."""
     lost = dict.fromkeys(info.meshes.keys() - names, "its mark cannot be read after rounding to the file's precision")
     records = {name: info.record.meshes[name] for name in names}
     meshes = {name: info.meshes[name] for name in names}
-    return SceneInfo(meshes, {**info.skipped, **lost}, SceneRecord(records))
+    return SceneInfo(meshes, {**info.skipped, **lost}, SceneRecord(records).sealed(key))
 
 
 def _unchanged(skipped: Mapping[str, str]) -> list[str]:

@@ -89,6 +89,8 @@ class FileReader:
             AlignmentError: if the suspect cannot be aligned with the original.
         """
         loaded = None if record is None else load_record(record)
+        if loaded is not None:
+            loaded.caveats(self.key)  # refuses an edited one at once
         if original is None:
             return self._outcome(self._read_blind(suspect, loaded), suspect, loaded)
         if loaded is not None and self.schemes and self.schemes[0] != loaded.scheme:
@@ -150,6 +152,9 @@ class FileReader:
     def _outcome(self, detection: Detection, suspect: Path, record: Record | SceneRecord | None) -> FileOutcome:
         """Describe a detection, with the bound that holds if the commitment is older than the suspect."""
         timestamped = None
+        if record is not None:
+            caveats = dict.fromkeys((*record.caveats(self.key), *detection.evidence.caveats))
+            detection = detection._replace(evidence=detection.evidence._replace(caveats=tuple(caveats)))
         if record is not None and self.commitment is not None:
             charges = self.commitment.charges(record, claimed=self.message is not None)
             timestamped = detection.evidence.charged(*charges)

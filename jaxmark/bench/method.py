@@ -9,7 +9,6 @@ import shlex
 import string
 import subprocess
 import tempfile
-import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -22,6 +21,7 @@ from jaxtyping import Bool
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import load_mesh, save_mesh
 from jaxmark.files.atomic import read_file
+from jaxmark.files.typed import parse_toml
 from jaxmark.geometry.mesh import Mesh
 
 Bits = Bool[np.ndarray, " bits"]
@@ -143,8 +143,8 @@ def _from_python(path: Path, digest: str, bits: int) -> Any:
 
 def _from_toml(path: Path) -> Method:
     try:
-        declared = tomllib.loads(read_file(path, _MAX_FILE_BYTES).decode())
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        declared = parse_toml(read_file(path, _MAX_FILE_BYTES))
+    except JaxmarkError as error:
         raise JaxmarkError(f"{path} is not a TOML file: {error}.") from None
     if missing := [name for name in _REQUIRED if name not in declared]:
         raise JaxmarkError(f"{path} declares no {missing[0]}; a method needs {', '.join(_REQUIRED)}.")

@@ -114,7 +114,7 @@ def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
                     continue
                 ((kind, row),) = data.items()
                 counts[kind] += _take(catalogue.database, kind, row)
-            except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+            except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
                 reason = str(error).rstrip(".") if isinstance(error, JaxmarkError) else "it is damaged"
                 raise JaxmarkError(f"{path} cannot be imported: line {number}: {reason}.") from None
     return _counted(counts)

@@ -8,7 +8,6 @@ import math
 import os
 import pickle
 import time
-import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
@@ -27,7 +26,7 @@ from jaxmark.evaluation.cells import Cell, Pool, run
 from jaxmark.evaluation.study_results import Results
 from jaxmark.files import load_mesh
 from jaxmark.files.atomic import read_file
-from jaxmark.files.typed import decode
+from jaxmark.files.typed import parse_toml
 from jaxmark.geometry.canonical import geometry_hash
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -344,10 +343,10 @@ def load_study(path: str | os.PathLike[str]) -> Study:
     """
     name = os.fspath(path)
     try:
-        declared = tomllib.loads(decode(read_file(path, _MAX_FILE_BYTES)))
+        declared = parse_toml(read_file(path, _MAX_FILE_BYTES))
     except OSError as error:
         raise JaxmarkError(f"Cannot read {name}: {error.strerror}.") from None
-    except (tomllib.TOMLDecodeError, JaxmarkError) as error:
+    except JaxmarkError as error:
         raise JaxmarkError(f"{name} is no TOML: {error}.") from None
     for part in ("meshes", "attacks"):
         if part not in declared:
@@ -363,6 +362,8 @@ def load_study(path: str | os.PathLike[str]) -> Study:
         return Study(**{**declared, "meshes": meshes})
     except JaxmarkError as error:
         raise JaxmarkError(f"{name}: {error}") from None
+    except OverflowError:
+        raise JaxmarkError(f"{name}: one of its numbers is too large.") from None
 
 
 Test = Callable[[Any], bool]

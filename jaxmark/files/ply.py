@@ -118,7 +118,7 @@ def parse(data: bytes) -> Source:
         outside = (faces < 0) | (faces >= len(coordinates.values))  # `make_mesh` refuses these with a better message
         normals.append(Transported(numbers, np.where(outside, -1, faces)))
     if (numbers := _normals(body, polygons)) is not None:
-        sizes = next((kind.sizes for name, kind in polygons.items() if name in _INDICES), _NONE)
+        sizes = next((polygons[name].sizes for name in _INDICES if name in polygons), _NONE)
         polygon = np.full(len(faces), -1)  # of each triangle; strips have none
         polygon[: (sizes - 2).sum()] = np.repeat(np.arange(len(sizes)), sizes - 2)
         normals.append(Transported(numbers, np.stack([polygon] * 3, axis=1)))
@@ -128,7 +128,7 @@ def parse(data: bytes) -> Source:
 def _packed_splat(data: bytes, body: _Body, packed: _Property, chunk: _Element) -> Source:
     """Read a compressed splat, in which every position is a number of 32 bits, and every chunk has a box."""
     low, high = (_triples(body, chunk.properties, (f"{end}_x", f"{end}_y", f"{end}_z")) for end in ("min", "max"))
-    if low is None or high is None or packed.type.itemsize != 4:
+    if low is None or high is None or packed.length is not None or packed.type.itemsize != 4:
         raise JaxmarkError("The file is a compressed splat without the boxes of its chunks; save it as plain PLY.")
     return splats.cloud(data, splats.unpack(body.integers(packed.starts, packed.type), low.values, high.values))
 

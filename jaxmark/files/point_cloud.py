@@ -140,7 +140,7 @@ def _check_counts(data: bytes) -> int:
     if (
         begin + _RECORD_BYTES * records > min(points, len(data))
         or (extended and later + _EXTENDED_BYTES * extended > len(data))
-        or (count * size > len(data) and not packed)
+        or (points + count * size > len(data) and not packed)
     ):
         raise JaxmarkError(
             f"This LAS or LAZ file is damaged: its header counts {count} points and {records + extended} other records,"

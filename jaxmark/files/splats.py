@@ -87,8 +87,10 @@ def parse_spz(data: bytes) -> Source:
     body = np.frombuffer(_take(read, size), np.uint8)
     if version == 1:
         return cloud(data, body.view("<f2").reshape(-1, 3).astype(np.float64))
-    low, middle, high = body.reshape(-1, 3).astype(np.int64).T
-    whole = low + (middle << 8) + ((high ^ 0x80) - 0x80 << 16)  # 24 bits with a sign
+    low, middle, high = body.reshape(-1, 3).T
+    whole = high.astype(np.int8).astype(np.int32) << 16  # 24 bits, of which the first is the sign
+    whole |= middle.astype(np.int32) << 8
+    whole |= low
     return cloud(data, np.ldexp(whole.reshape(-1, 3).astype(np.float64), -fraction))
 
 

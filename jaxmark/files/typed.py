@@ -1,8 +1,10 @@
 """Text that people type, paste or export: decoded from UTF-8, and equal wherever it looks the same."""
 
 import re
+import tomllib
 import unicodedata
 from collections.abc import Collection, Iterable
+from typing import Any
 
 from jaxmark.errors import JaxmarkError
 
@@ -26,6 +28,20 @@ def decode(data: bytes) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise JaxmarkError(f"it is not text in UTF-8 (byte {error.start}); save it as UTF-8") from None
+
+
+def parse_toml(data: bytes) -> dict[str, Any]:
+    """Parse a TOML file.
+
+    Raises:
+        JaxmarkError: half a sentence, if it is none, or is nested too deeply, or has a number of thousands of digits.
+    """
+    try:
+        return tomllib.loads(decode(data))
+    except RecursionError:
+        raise JaxmarkError("it is nested too deeply") from None
+    except ValueError as error:
+        raise JaxmarkError(str(error).rstrip(".")) from None
 
 
 def normalise(text: str) -> str:

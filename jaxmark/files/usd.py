@@ -73,8 +73,8 @@ class _Mesh(NamedTuple):
             return "its faces are no integers"
         if sizes is None or indices is None or not len(sizes):
             return "it has no faces" + ", or they are in another layer" * elsewhere
-        if sizes.ndim != 1 or indices.ndim != 1 or sizes.dtype.kind == "f" or indices.dtype.kind == "f":
-            return "its faces are no integers"
+        if sizes.ndim != 1 or indices.ndim != 1 or not sizes.dtype == indices.dtype == np.int32:
+            return "its faces are no integers of 32 bits, as USD has them"
         if sizes.min() < 3:
             return f"one of its faces has {sizes.min()} corners; it needs at least three"
         if (corners := int(sizes.sum(dtype=np.int64))) != len(indices):

@@ -274,7 +274,7 @@ def with_blind(
         JaxmarkError: see `detect`.
     """
     blind = [read_blind(suspect, key, bits=mark.bits, message=message, schemes=[scheme]) for scheme in schemes]
-    united = unite(found, blind) if blind else found
+    united = unite(mark, found, blind) if blind else found
     if mark.record is None:
         return united
     names = " and ".join(sorted(scheme.name for scheme in schemes)) or "none"
@@ -341,7 +341,7 @@ def embed_scene(
     if not marked:
         raise JaxmarkError(f"None of the {len(meshes)} meshes can carry the mark: {_reasons(skipped)}.")
     infos = {name: infos[name] for name in meshes if name in infos}
-    record = SceneRecord({name: info.record for name, info in infos.items()})
+    record = SceneRecord({name: info.record for name, info in infos.items()}).sealed(key)
     return {name: marked[name] for name in infos}, SceneInfo(infos, skipped, record)
 
 
@@ -386,10 +386,12 @@ def detect_scene(
 
     Raises:
         AlignmentError: if no mesh can be aligned with that of the original.
-        JaxmarkError: if no mesh can be compared, or an original mesh is missing or is not the recorded one; see also
-            `detect`.
+        JaxmarkError: if no mesh can be compared, an original mesh is missing or is not the recorded one, or the record
+            was edited; see also `detect`.
     """
-    marked = originals if record is None else record.meshes
+    marked, caveats = originals, ()
+    if record is not None:
+        marked, caveats = record.meshes, record.caveats(key)
     names = [find_name(name, originals) or name for name in names]
     # The order of a file's meshes decides which of equal meshes counts; a record's digest does not cover it.
     chosen = sorted(name for name in marked if name in names or not names)
@@ -445,7 +447,7 @@ def detect_scene(
     # of all originals count, and the number of meshes is that of all originals.
     orders = [charge for marker in markers.values() for charge in marker.order_charges]
     presented = *ledger.selection(len(chosen), len(marked)), *ledger.in_all(orders)
-    caveats = tuple(dict.fromkeys(caveat for marker in markers.values() for caveat in marker.caveats))
+    caveats = (*caveats, *dict.fromkeys(caveat for marker in markers.values() for caveat in marker.caveats))
     alone = () if len(chosen) == 1 else (ledger.SCENE.charge("one mesh"), ledger.MESHES.charge("each", len(chosen)))
 
     def charged(evidence: Evidence, *charges: Charge) -> Evidence:

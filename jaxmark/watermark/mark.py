@@ -157,6 +157,11 @@ class Mark:
                 "The original has vertices that no face uses, and another order than when it was marked with this"
                 " record; mark it without the record."
             )
+        if not original.is_whole:
+            raise JaxmarkError(
+                "The original was edited since it was marked with this record; give an exact copy, or mark without the"
+                " record."
+            )
         unit = original.to_host(self.carrier.displacement(jax.device_put(amplitudes.astype(original.signal.dtype))))
         size = float(distortion.rms(unit[original.used]))
         if not (math.isfinite(size) and size > 0):

@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -27,14 +28,15 @@ from jaxmark.watermark.blind.writing import Writer, remedies
 from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
+from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence
-from jaxmark.watermark.evidence.ledger import rounded_up
+from jaxmark.watermark.evidence.ledger import Charge, rounded_up
 from jaxmark.watermark.interfaces import Detector, Scheme
 from jaxmark.watermark.mark import EmbedInfo, Mark, recall
 from jaxmark.watermark.nonblind import Alternatives, read
 from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, reference_of
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, Survival
-from jaxmark.watermark.record import Record, commit
+from jaxmark.watermark.record import Record, commit, is_recorded
 from jaxmark.watermark.schemes.passband import choose_pass_band
 from jaxmark.watermark.schemes.registry import (
     DEFAULT_SCHEME,
@@ -472,12 +474,12 @@ class CombinedMarker:
     def read(self, registered: Sequence[Any], message: bytes | None = None) -> Detection:
         """See `Marker`: the evidence of all marks is united."""
         detections = [marker.read(part, message) for marker, part in zip(self._all, registered, strict=True)]
-        return unite(detections[0], detections[1:])
+        return unite(self.nonblind, detections[0], detections[1:])
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
         """See `Marker`: the evidence of all marks is united."""
         detections = [marker.detect(suspect, message) for marker in self._all]
-        return unite(detections[0], detections[1:])
+        return unite(self.nonblind, detections[0], detections[1:])
 
     def guess(self, found: Detection) -> bytes | None:
         """See `Marker`: decodes the non-blind mark."""
@@ -576,22 +578,52 @@ def prepare(mesh: Mesh, key: bytes, bits: int, scheme: AnyScheme, *, adapt_to: B
     return CombinedMarker(marker, blind) if blind else marker
 
 
-def unite(nonblind: Detection, blind: Sequence[Detection]) -> Detection:
-    """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection."""
+def unite(mark: Mark, nonblind: Detection, blind: Sequence[Detection]) -> Detection:
+    """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection.
+
+    It is about one message: that of the non-blind mark, or else the first that was decoded. Marks of other messages are
+    not counted.
+
+    Args:
+        mark: the non-blind mark, whose record may commit to a message.
+        nonblind: its detection.
+        blind: the detections of the other marks.
+    """
     detections = (nonblind, *blind)
-    decoded = next((detection for detection in detections if detection.message is not None), nonblind)
+    message = next((about for each in detections if (about := _subject(each)) is not None), None)
+    agreeing = [_subject(detection) in (None, message) for detection in detections]
+    decoded = next((each for each in compress(detections, agreeing) if each.message is not None), nonblind)
+    recorded, charges = decoded.recorded, list[Charge]()
+    if decoded is not nonblind and decoded.message is not None:
+        recorded = is_recorded(mark.record, decoded.message, mark.choices)
+        if recorded is not None:
+            charges.append(ledger.MESSAGE.charge("claimed or recorded" if recorded else "another"))
     notes = tuple(
         f"The mark of {detection.scheme!r}, if it were the only one that was read, would have a probability of"
         f" {'about' if detection.evidence.caveats else 'at most'} 10^{rounded_up(detection.log10_p):.1f}."
         for detection in blind
     )
+    notes += tuple(
+        f"The mark of {detection.scheme!r} has another message, and is not counted."
+        for detection, agrees in zip(detections, agreeing, strict=True)
+        if not agrees
+    )
+    if recorded is False and decoded is not nonblind:
+        notes += (f"The mark of {decoded.scheme!r} has another message than the one in the record.",)
+    evidence = (each.evidence if agrees else Evidence() for each, agrees in zip(detections, agreeing, strict=True))
     return nonblind._replace(
         message=decoded.message,
-        recorded=decoded.recorded,
-        evidence=Evidence.product(*(detection.evidence for detection in detections)),
+        recorded=recorded,
+        scheme=decoded.scheme,
+        evidence=Evidence.product(*evidence).charged(*charges),
         notes=(*nonblind.notes, *notes),
         parts={detection.scheme: detection for detection in detections},
     )
+
+
+def _subject(detection: Detection) -> bytes | None:
+    """Return the message that the evidence is about: what was decoded, or else what was claimed."""
+    return detection.claimed if detection.message is None else detection.message
 
 
 def _does_not_read(marker: NonBlindMarker | BlindMarker, remedy: str) -> JaxmarkError:

@@ -30,7 +30,8 @@ from jaxmark.watermark.evidence.ledger import Charge
 
 _MAX_FILE_BYTES = 2**30  # a record of some hundred million points, or as many digests
 _FORMAT = "jaxmark-record"
-_SCENE_FORMAT, _SCENE_VERSION = "jaxmark-scene", 1
+_SCENE_FORMAT, _SCENE_VERSION = "jaxmark-scene", 2
+_OPEN_SCENE_VERSION = 1  # which has no code
 _COMMITMENT = "jaxmark-deposit"  # the format of a commitment's file, which keeps its first name
 
 # TimeStampReq of RFC 3161, in DER: version 1, a SHA-256 imprint of 32 bytes, and the request for the authority's
@@ -104,6 +105,10 @@ class Record:
     def meshes(self) -> Mapping[str, "Record"]:
         """The record by the name of its mesh, as in `SceneRecord`; the mesh has no name."""
         return {"": self}
+
+    def caveats(self, key: bytes) -> tuple[str, ...]:
+        """Return none: unlike those of a scene, the record of one mesh always has a code, which `check` checks."""
+        return ()
 
     def to_json(self) -> str:
         """Return the record as JSON text."""
@@ -244,6 +249,7 @@ class SceneRecord:
     """The records of a file's meshes, by name; each of them can also be used to read its mesh alone."""
 
     meshes: Mapping[str, Record]
+    code: str = ""  # the owner's authentication code of the names and their records; empty if there is none
 
     def __post_init__(self) -> None:
         """Check that the meshes agree in everything that is stated of the whole."""
@@ -280,12 +286,37 @@ class SceneRecord:
     def to_json(self) -> str:
         """Return the records as JSON text."""
         meshes = {name: json.loads(record.to_json()) for name, record in self.meshes.items()}
-        return json.dumps({"format": _SCENE_FORMAT, "version": _SCENE_VERSION, "meshes": meshes}, indent=2) + "\n"
+        version = {"version": _SCENE_VERSION, "code": self.code} if self.code else {"version": _OPEN_SCENE_VERSION}
+        return json.dumps({"format": _SCENE_FORMAT, **version, "meshes": meshes}, indent=2) + "\n"
 
     def digest(self) -> str:
         """Compute SHA-256 over all records, hexadecimal; the key is not needed for it."""
-        digests = {name: record.digest() for name, record in self.meshes.items()}
-        return hashlib.sha256(b"jaxmark/scene" + canonical_json(digests)).hexdigest()
+        return hashlib.sha256(b"jaxmark/scene" + self._digests()).hexdigest()
+
+    def sealed(self, key: bytes) -> "SceneRecord":
+        """Return the records with the authentication code of their owner."""
+        return replace(self, code=self._code(key))
+
+    def caveats(self, key: bytes) -> tuple[str, ...]:
+        """Return why readings are no proof: without a code, meshes may have been left out of the record.
+
+        Whoever chooses the meshes after the suspect exists can choose those that happen to agree with it.
+
+        Raises:
+            JaxmarkError: if the code does not match, for this key.
+        """
+        if not self.code:
+            return ("the record of the scene has no code, so that meshes may have been left out of it",)
+        # With another key, each record says so.
+        if self._any.key == commitment(key) and not hmac.compare_digest(self.code, self._code(key)):
+            raise JaxmarkError("The record of the scene was edited: its code does not match its meshes.")
+        return ()
+
+    def _digests(self) -> bytes:
+        return canonical_json({name: record.digest() for name, record in self.meshes.items()})
+
+    def _code(self, key: bytes) -> str:
+        return Choices(Key(key), b"").derive("scene", KEY_BYTES, self._digests()).hex()
 
 
 def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
@@ -297,16 +328,18 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
     data = read_json(path)
     if not isinstance(data, dict) or data.get("format") != _SCENE_FORMAT:
         return Record.load(path)
-    meshes = data.get("meshes")
-    if data.get("version") != _SCENE_VERSION:
+    meshes, code = data.get("meshes"), data.get("code", "")
+    if data.get("version") not in (_OPEN_SCENE_VERSION, _SCENE_VERSION):
         raise JaxmarkError(
             f"The record {path} is of version {data.get('version')!r}; this jaxmark reads {_SCENE_VERSION}."
         )
     if not isinstance(meshes, dict) or not meshes:
         raise JaxmarkError(f"The record {path} is damaged: it has no meshes.")
+    if not (isinstance(code, str) and code.isascii()):
+        raise JaxmarkError(f"The record {path} is damaged: its code is none.")
     records = {name: Record.of(item, f"{path}, mesh {name!r},") for name, item in meshes.items()}
     try:
-        return SceneRecord(records)
+        return SceneRecord(records, code)
     except JaxmarkError as error:
         raise JaxmarkError(f"{path}: {error}") from None
 

@@ -415,6 +415,10 @@ TOML = 'samples = 1\npayloads = [16]\nbudgets = [0.002]\n[meshes]\nball = "small
     [
         (None, "Cannot read study.toml"),
         ("samples = = 1", "study.toml is no TOML"),
+        (f"samples = {'[' * 5000}", "study.toml is no TOML: it is nested too deeply"),
+        (f"samples = {'9' * 5000}", "study.toml is no TOML: "),
+        (TOML.replace("[0.002]\n[m", f"[{'9' * 400}]\n[m"), "study.toml: "),
+        (TOML.replace("noise = [0.002]", f"noise = [{'9' * 400}]"), "study.toml: one of its numbers is too large"),
         ("samples = 1", "declares no meshes"),
         ('meshes = {a = "a.ply"}', "declares no attacks"),
         (TOML + "[colours]\na = 1", "no field 'colours'"),

@@ -146,6 +146,23 @@ HEAD = b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty flo
 FACE = b"element face 1\nproperty list uchar int vertex_indices\nend_header\n"
 STRIPS = b"element tristrips 1\nproperty list int int vertex_indices\nend_header\n"
 BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
+BOXES = b"ply\nformat ascii 1.0\nelement chunk 1\n"
+BOXES += b"".join(
+    b"property float %s\n" % name for name in (b"min_x", b"min_y", b"min_z", b"max_x", b"max_y", b"max_z")
+)
+BOXES += b"element vertex 1\nproperty uint packed_position\nend_header\n"
+
+
+@pytest.mark.parametrize("other", [b"1 0", b"5 0 1 2 0 1"])
+def test_of_two_lists_of_corners_one_gives_faces_and_their_normals(tmp_path: Path, other: bytes) -> None:
+    lists = b"element face 1\nproperty list uchar int vertex_index\n" + FACE[len("element face 1\n") :]
+    normals = b"".join(b"property float %s\n" % name for name in (b"nx", b"ny", b"nz"))
+    data = (
+        HEAD
+        + lists.replace(b"end_header", normals + b"end_header")
+        + BODY.replace(b"3 0 1 2", other + b" 3 0 1 2 0 0 1")
+    )
+    np.testing.assert_array_equal(loaded(tmp_path, "two.ply", data).faces, [[0, 1, 2]])
 
 
 @pytest.mark.parametrize(
@@ -161,6 +178,7 @@ BODY = b"0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
         (HEAD.replace(b"vertex 3", b"vertex 999999999999999") + FACE + BODY, "ends in row 4 .*vertex"),
         (HEAD.replace(b"float z", b"float w") + FACE + BODY, "x, y and z"),
         (HEAD.replace(b"float x", b"uint packed_position") + FACE + BODY, "compressed splat without the boxes"),
+        (BOXES.replace(b"uint", b"list uchar uint") + b"0 0 0 1 1 1\n0\n", "compressed splat without"),
         (HEAD + FACE.replace(b"uchar int", b"uchar float") + BODY, "integers"),
         (HEAD + FACE.replace(b"uchar int", b"float int") + BODY, "line 8"),
         (HEAD + FACE.replace(b"_indices", b"s") + BODY, "vertex_indices"),

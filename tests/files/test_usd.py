@@ -292,6 +292,12 @@ def _square(old: str, new: str) -> Callable[[], bytes]:
         (lambda: layer({}, "    subLayers = [@b.usda@]"), "mark the files it refers to: 'b.usda'"),
         (_square("[4]", "[2, 2]"), "one of its faces has 2 corners"),
         (_square("[4]", "[3]"), "have 3 corners, but there are 4 indices"),
+        (
+            _square("int[] faceVertexCounts = [4]", f"int64[] faceVertexCounts = {[2**62] * 3 + [2**62 + 4]}"),
+            "of 32 bits",
+        ),
+        (_square("int[] faceVertexCounts", "uchar[] faceVertexCounts"), "of 32 bits"),
+        (_square("int[] faceVertexIndices", "int64[] faceVertexIndices"), "of 32 bits"),
         (_square("[0, 1, 2, 3]", "[0, 1, 2, 4]"), "refers to point 4, but there are 4"),
         (_square("[0, 1, 2, 3]", "[0, 1, 2, -1]"), "refers to point -1, but there are 4"),
         (_square("int[] faceVertexCounts", "float[] faceVertexCounts"), "no integers"),

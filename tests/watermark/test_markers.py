@@ -13,8 +13,9 @@ from jaxmark import distortion
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.watermark.carriers import KeyedReader
-from jaxmark.watermark.evidence import bounds
-from jaxmark.watermark.markers import NonBlindMarker
+from jaxmark.watermark.evidence import bounds, ledger
+from jaxmark.watermark.evidence.detection import Detection, Evidence
+from jaxmark.watermark.markers import NonBlindMarker, unite
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.modulated import EigenScheme, HostScheme
 from jaxmark.watermark.schemes.registry import get_nonblind, make_scheme
@@ -446,3 +447,28 @@ def test_a_remeshed_suspect_of_a_shape_that_is_its_own_mirror_image(key: jm.Key)
     assert plain.message == other.message == b"ok"
     assert plain.registration.pose.mirrors != other.registration.pose.mirrors
     assert other.log10_p == pytest.approx(plain.log10_p, rel=0.1)
+
+
+def test_marks_of_different_messages_are_not_united(sphere: Mesh, key: jm.Key):
+    def found(scheme: str, message: bytes | None, log10_p: float, claimed: bytes | None = None) -> Detection:
+        evidence = Evidence(log10_p, log10_p, log10_p)
+        return Detection(message, evidence, None, np.zeros(1), None, scheme, claimed=claimed)
+
+    _, info = jm.embed(sphere, b"ok", key, budget=2e-3)
+    mark = jm.make_marker(sphere, key, record=info.record)
+    keyed, local = found("keyed", b"ok", -20.0), found("local", b"no", -10.0)
+    both = unite(mark, keyed, [local])
+    assert both.log10_p == unite(mark, keyed, [found("local", None, 0.0)]).log10_p > -20
+    assert (both.message, both.scheme) == (b"ok", "keyed")
+    assert "'local' has another message, and is not counted" in both.notes[-1]
+    assert unite(mark, keyed, [local._replace(message=b"ok")]).log10_p < -25
+
+    # The claim is what the evidence is about, even if it was not decoded.
+    claim = found("keyed", None, -5.0, claimed=b"ok")
+    assert unite(mark, claim, [local._replace(claimed=b"ok")]).message is None
+    assert unite(mark, claim, [found("local", b"ok", -10.0, claimed=b"ok")]).message == b"ok"
+
+    alone = unite(mark, found("keyed", None, 0.0), [local])
+    assert (alone.message, alone.scheme, alone.recorded) == (b"no", "local", False)
+    assert ledger.MESSAGE.charge("another") in alone.evidence.charges
+    assert "another message than the one in the record" in alone.notes[-1]

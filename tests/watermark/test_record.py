@@ -170,6 +170,8 @@ def test_an_edited_original_gives_an_estimate_and_others_are_refused(marked, ori
     assert found.detected(allow_estimate=True)
     assert not found.detected()
     assert "the original was edited" in found.evidence.caveats[0]
+    with pytest.raises(jm.JaxmarkError, match="was edited since it was marked"):
+        jm.make_marker(Mesh(dented, original.faces), key, record=record).embed(MESSAGE)
     with pytest.raises(jm.JaxmarkError, match="looks like the marked file"):
         jm.detect(suspect, original=suspect, key=key, record=record)
     with pytest.raises(jm.JaxmarkError, match="their shapes differ by"):

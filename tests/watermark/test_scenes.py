@@ -1,5 +1,6 @@
 """Files of several meshes: each is marked alone, and what they prove together is no more than they do."""
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -78,7 +79,7 @@ def test_a_scene_of_other_shapes_is_no_refusal_of_its_file(key: jm.Key, tmp_path
 
 def read(marked, originals, key: jm.Key, noise: float, **options) -> Detection:
     meshes, info = marked
-    record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
+    record = SceneRecord({name: info.record.meshes[name] for name in NAMES}).sealed(key)
     # In another order, under other names, turned and scaled.
     suspects = {f"object {name}": moved(meshes[name], TURN, noise) for name in reversed(NAMES)}
     return detect_scene(suspects, originals=originals, key=key, record=record, **options)
@@ -100,7 +101,7 @@ def test_together_they_prove_more_than_the_best_alone(marked, originals, key: jm
 def test_a_claim_that_a_record_of_the_scene_refutes_is_refused(marked, originals, key: jm.Key):
     meshes, info = marked
     both = {name: originals[name] for name in ("left", "right")}
-    record = SceneRecord({name: info.record.meshes[name] for name in both})
+    record = SceneRecord({name: info.record.meshes[name] for name in both}).sealed(key)
     with pytest.raises(jm.JaxmarkError, match="commits to another message"):
         detect_scene(meshes, originals=both, key=key, record=record, message=b"no")
 
@@ -182,7 +183,7 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key, monkeypatch):
     meshes, info = marked
     np.testing.assert_array_equal(meshes["again"].vertices, meshes["left"].vertices)
     twice = dict.fromkeys(("left", "again"), originals["left"])
-    record = SceneRecord({name: info.record.meshes[name] for name in twice})
+    record = SceneRecord({name: info.record.meshes[name] for name in twice}).sealed(key)
     prepared = []
     monkeypatch.setattr(
         everyday, "make_marker", lambda mesh, *rest, **_: prepared.append(mesh) or make_marker(mesh, *rest, **_)
@@ -196,7 +197,7 @@ def test_equal_meshes_count_once(marked, originals, key: jm.Key, monkeypatch):
     # blind marks beside the record's is none.
     charged = alone.log10_p - np.log10(0.97) - 2 * np.log10(0.97) + np.log10(2 * 2) + np.log10(0.97)
     assert found.log10_p == pytest.approx(charged)
-    turned = SceneRecord(dict(reversed(record.meshes.items())))
+    turned = dataclasses.replace(record, meshes=dict(reversed(record.meshes.items())))
     again = detect_scene({name: meshes[name] for name in twice}, originals=twice, key=key, record=turned)
     assert turned.digest() == record.digest()
     assert again.log10_p == found.log10_p, "a digest does not cover the order of the meshes"
@@ -235,10 +236,25 @@ def test_sums_over_keys_have_the_variance_that_the_bound_assumes(originals, key:
 @pytest.mark.parametrize("claimed", [None, MESSAGE])
 def test_what_is_not_marked_is_not_detected(marked, originals, key: jm.Key, claimed):
     _, info = marked
-    record = SceneRecord({name: info.record.meshes[name] for name in NAMES})
+    record = SceneRecord({name: info.record.meshes[name] for name in NAMES}).sealed(key)
     suspects = {name: moved(mesh, np.eye(3), 0.005) for name, mesh in originals.items()}
     found = detect_scene(suspects, originals=originals, key=key, record=record, message=claimed)
     assert not found.detected(0.01)
+
+
+def test_a_record_of_which_meshes_were_left_out_proves_nothing(marked, originals, key: jm.Key, tmp_path: Path):
+    """Whoever leaves meshes out chooses those that happen to agree with the suspect."""
+    meshes, info = marked
+    fewer = dataclasses.replace(info.record, meshes={name: info.record.meshes[name] for name in NAMES})
+    (tmp_path / "record.json").write_text(fewer.to_json())
+    with pytest.raises(jm.JaxmarkError, match="The record of the scene was edited"):
+        detect_scene(meshes, originals=originals, key=key, record=load_record(tmp_path / "record.json"))
+    scene = json.loads(fewer.to_json())
+    del scene["code"]
+    (tmp_path / "record.json").write_text(json.dumps(scene | {"version": 1}))
+    found = detect_scene(meshes, originals=originals, key=key, record=load_record(tmp_path / "record.json"))
+    assert (found.detected(), found.detected(allow_estimate=True)) == (False, True)
+    assert "meshes may have been left out" in found.evidence.caveats[0]
 
 
 def test_records_of_files(marked, tmp_path: Path):
