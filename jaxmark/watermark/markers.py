@@ -597,7 +597,7 @@ def unite(mark: Mark, nonblind: Detection, blind: Sequence[Detection]) -> Detect
     if decoded is not nonblind and decoded.message is not None:
         recorded = is_recorded(mark.record, decoded.message, mark.choices)
         if recorded is not None:
-            charges.append(ledger.MESSAGE.charge("claimed or recorded" if recorded else "another"))
+            charges.append(ledger.MARKS_MESSAGE.charge("claimed or recorded" if recorded else "another"))
     notes = tuple(
         f"The mark of {detection.scheme!r}, if it were the only one that was read, would have a probability of"
         f" {'about' if detection.evidence.caveats else 'at most'} 10^{rounded_up(detection.log10_p):.1f}."

@@ -470,5 +470,7 @@ def test_marks_of_different_messages_are_not_united(sphere: Mesh, key: jm.Key):
 
     alone = unite(mark, found("keyed", None, 0.0), [local])
     assert (alone.message, alone.scheme, alone.recorded) == (b"no", "local", False)
-    assert ledger.MESSAGE.charge("another") in alone.evidence.charges
+    assert ledger.MARKS_MESSAGE.charge("another") in alone.evidence.charges
+    beside = alone.evidence.charged(ledger.BESIDE.charge("local"))
+    assert ledger.is_charged_along_a_path(beside.charges)
     assert "another message than the one in the record" in alone.notes[-1]

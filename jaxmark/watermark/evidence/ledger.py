@@ -188,18 +188,22 @@ MARKS = Choice(
     "product: no share, but a factor by Fisher's method; one mark (uncommitted): 1/n for each of the n marks",
 )
 
-# The record of several marks in one mesh is that of the first, so that the reader names the others.
+# The record of several marks in one mesh is that of the first, so that the reader names the others. One of these may be
+# decoded where that of the record is not; its message is, or is not, the one that the record commits to.
+MARKS_MESSAGE = Choice(
+    "message", (Alternative("claimed or recorded", 0.97, MARKS), Alternative("another", 0.03, MARKS))
+)
 BESIDE = Choice(
     "marks beside the record's",
     (
         Alternative("none", 0.97, PASS_BAND),
-        Alternative("field", 0.01, MARKS),
-        Alternative("local", 0.01, MARKS),
-        Alternative("rooted", 0.002, MARKS),
-        Alternative("field and local", 0.005, MARKS),
-        Alternative("field and rooted", 0.001, MARKS),
-        Alternative("local and rooted", 0.001, MARKS),
-        Alternative("field and local and rooted", 0.001, MARKS),
+        Alternative("field", 0.01, MARKS_MESSAGE),
+        Alternative("local", 0.01, MARKS_MESSAGE),
+        Alternative("rooted", 0.002, MARKS_MESSAGE),
+        Alternative("field and local", 0.005, MARKS_MESSAGE),
+        Alternative("field and rooted", 0.001, MARKS_MESSAGE),
+        Alternative("local and rooted", 0.001, MARKS_MESSAGE),
+        Alternative("field and local and rooted", 0.001, MARKS_MESSAGE),
     ),
 )
 
