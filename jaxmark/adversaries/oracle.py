@@ -23,6 +23,7 @@ from jaxmark.seeds import Randomness, generator
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark.coding.keys import Choices, Key
 from jaxmark.watermark.coding.message import check_size
+from jaxmark.watermark.evidence.detection import check_alpha
 from jaxmark.watermark.markers import NonBlindMarker
 from jaxmark.watermark.reading.detectors import claims
 
@@ -280,6 +281,5 @@ class _Space:
 
 def _log10(alpha: float) -> float:
     """Return log10 of a probability; refuse one that is not in (0, 1)."""
-    if not 0 < alpha < 1:
-        raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    check_alpha(alpha)
     return math.log10(alpha)

@@ -302,8 +302,8 @@ def mark_copy(
     """
     record = copy.with_name(copy.name + RECORD_SUFFIX)
     with writing_pair(copy, record, overwrite=overwrite) as pair:
-        catalogue.add(original)
         outcome = mark_file(original, pair.file, pair.record, key=key, recipient=recipient, budget=budget)
+        catalogue.add(original)
         # The recipient is stored first: a recipient without a copy does no harm, but a copy without a recipient in the
         # catalogue could not be traced.
         catalogue.add_copy(Record.load(pair.record), recipient, file_hash(pair.file))

@@ -70,6 +70,7 @@ from jaxmark.watermark.blind.field import FieldScheme
 from jaxmark.watermark.coding.keys import commitment, new_key, save_key
 from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.everyday import capacity
+from jaxmark.watermark.evidence.detection import check_alpha
 from jaxmark.watermark.evidence.ledger import charges_as_json
 from jaxmark.watermark.perception.budget import Budget
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE
@@ -300,13 +301,15 @@ def detect_command(
         raise JaxmarkError("--commitment is to a record; also give the --record that it contains.")
     if presence and (message is not None or bits):
         raise JaxmarkError("A presence mark has no message; leave out --message and --bits, or --presence.")
+    check_alpha(alpha)
     named = schemes or ()
     blind = [name for name in named if name in BLIND_SCHEMES]
     if original is None or len(named) == len(blind) == 1:
         if named and not blind:
             raise JaxmarkError(f"The scheme {named[0]!r} is not blind; give --original.")
         if align != "auto" or report is not None or dossier is not None:
-            raise JaxmarkError("--align, --report and --dossier are for non-blind reading; give --original.")
+            way = "give --original" if original is None else "leave them out"
+            raise JaxmarkError(f"--align, --report and --dossier are for non-blind reading; {way}.")
         original = None
     reader = FileReader(
         read_key(key_file),
@@ -342,9 +345,7 @@ def detect_command(
 @click.option(
     "--record", "record_file", type=FILE, help="The record of any copy; it is checked against key and original."
 )
-@click.option(
-    "--top", type=click.IntRange(1), default=10, show_default=True, help="Number of recipients in the ranking."
-)
+@click.option("--top", type=click.IntRange(1), help="Number of recipients in the ranking.  [default: 10]")
 @ALIGN
 @ALPHA
 @QUIET
@@ -356,7 +357,7 @@ def identify_command(
     recipients: Path | None,
     catalogue_file: Path | None,
     record_file: Path | None,
-    top: int,
+    top: int | None,
     align: Align,
     alpha: float,
     as_json: bool,
@@ -369,12 +370,12 @@ def identify_command(
     Exit status 0 if a recipient is accused, 1 if nobody is accused, 2 if SUSPECT is refused, 3 if the probability is
     only an estimate, for example because the original was edited. An estimate accuses nobody.
     """
-    if not 0 < alpha < 1:
-        raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+    check_alpha(alpha)
     if catalogue_file is not None:
-        if original is not None or recipients is not None or record_file is not None:
+        if any(given is not None for given in (original, recipients, record_file, top)):
             raise JaxmarkError(
-                "A catalogue holds originals, recipients and records; leave out --original, --recipients and --record."
+                "A catalogue holds originals, recipients and records, and names all that are accused; leave out"
+                " --original, --recipients, --record and --top."
             )
         identify_by_catalogue(suspect, catalogue_file, key_file, align, alpha, as_json)
     if original is None or recipients is None:
@@ -387,7 +388,7 @@ def identify_command(
     current().doing(f"testing the copies of {len(names)} recipients in {suspect}")
     nobody = f"none of {len(names)} recipients is accused"
     try:
-        ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top, align=align)
+        ranking = identify(meshes[0], names, original=meshes[1], key=key, record=record, top=top or 10, align=align)
     except AlignmentError as error:
         values = {"accused": [], "estimates": [], "ranking": [], "recipients": len(names), "notes": [str(error)]}
         answer(as_json, values, f"{nobody}: {error}")
@@ -579,13 +580,28 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 @QUIET
 @JSON
 def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, as_json: bool) -> None:
-    """Compute the largest payload, in bits, that MESH carries so that it survives noise and the loss of vertices."""
-    loaded = load_mesh(mesh)
-    bounds, noise = budget.bounds(loaded), budget.noise
-    current().doing(f"computing the capacity of {mesh}")
-    bits = capacity(loaded, budget, coverage=coverage, scheme=scheme)
+    """Compute the largest payload, in bits, that MESH carries so that it survives noise and the loss of vertices.
+
+    Of a file of several meshes, which are marked one by one, it is that of the mesh that carries most.
+    """
+    scene = load_scene(mesh)
+    meshes = scene.meshes if len(scene.meshes) + len(scene.skipped) > 1 else {"": load_mesh(mesh)}
+    each = {}
+    for name, part in meshes.items():
+        current().doing(f"computing the capacity of {name or mesh}")
+        try:
+            each[name] = capacity(part, budget, coverage=coverage, scheme=scheme)
+        except JaxmarkError:
+            if len(meshes) == 1:
+                raise
+            each[name] = 0  # as `embed` leaves such a mesh unchanged
+    most = max(each, key=lambda name: each[name])
+    bits, bounds, noise = each[most], budget.bounds(meshes[most]), budget.noise
     values = {"bits": bits, "budget": bounds.rms, "limits": bounds.limits, "noise": noise, "coverage": coverage}
     text = f"{bits} bits at {bounds}, noise {noise:g}, coverage {coverage:g}"
+    if len(meshes) > 1:
+        values["meshes"] = each
+        text += f"; of {len(each)} meshes, which `embed` marks one by one, {most!r} carries most"
     answer(as_json, values, text if bits else f"{text}; `embed` without --noise prints the noise that a mark survives")
 
 

@@ -9,6 +9,7 @@ import json
 import math
 import platform
 import shlex
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version
@@ -20,7 +21,7 @@ from jaxtyping import Float64
 
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.result import Alignment
-from jaxmark.app.output import make_folder
+from jaxmark.app.output import make_folder, power
 from jaxmark.errors import JaxmarkError, require
 from jaxmark.files.atomic import file_hash, write_atomically
 from jaxmark.geometry.mesh import Mesh
@@ -33,6 +34,7 @@ from jaxmark.watermark.mark import Mark
 from jaxmark.watermark.record import TimestampedCommitment
 
 _SIDES = {"front": 25.0, "right": 115.0, "back": 205.0, "left": 295.0}  # azimuths in degrees
+_MOST_ALPHA = 1e-6  # largest false-positive probability of a proof that others should believe
 _PACKAGES = ("jaxmark", "jax", "numpy", "scipy", "trimesh")
 
 
@@ -50,6 +52,8 @@ class Case:
     commitment: TimestampedCommitment | None
     timestamped: float | None  # log10 of the bound if the commitment is older than the suspect
     obtained: str  # when and where the suspect was obtained
+    meshes: Sequence[str] = ()  # names of the meshes that were selected
+    schemes: Sequence[str] = ()  # names of the schemes that were named
 
 
 def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alignment) -> Path:
@@ -81,12 +85,14 @@ def save_report(folder: Path, original: Original, suspect: Mesh, alignment: Alig
     return path
 
 
-def missing_proof(detection: Detection) -> str:
+def missing_proof(detection: Detection, alpha: float = _MOST_ALPHA) -> str:
     """Return why a detection has no dossier, which is only about proofs; "" if it may have one."""
+    alpha = min(alpha, _MOST_ALPHA)
     if detection.evidence.caveats:
         return f"There is no dossier of an estimate: {'; '.join(detection.evidence.caveats)}."
-    if not detection.detected():
-        return "There is no dossier, because nothing was detected at a false-positive probability of 10^-6."
+    if not detection.detected(alpha):
+        level = power(math.log10(alpha))
+        return f"There is no dossier, because nothing was detected at a false-positive probability of {level}."
     return ""
 
 
@@ -156,10 +162,16 @@ def _in_words(log10_p: float) -> str:
 def _command(case: Case) -> str:
     """Compose the command that repeats the detection, without the path of the key."""
     words = ["jaxmark", "detect", case.suspect.name, "--original", case.original.name, "--key", "KEYFILE"]
+    schemes = case.schemes
     if case.record is not None:
         words += ["--record", case.record.name]
     else:
-        words += ["--bits", str(case.mark.bits), "--scheme", case.mark.scheme.name]
+        words += ["--bits", str(case.mark.bits)]
+        schemes = schemes or (case.mark.scheme.name,)
+    if schemes:
+        words += ["--scheme", ",".join(schemes)]
+    for name in case.meshes:
+        words += ["--mesh", name]
     if case.found.registration.align != "auto":
         words += ["--align", case.found.registration.align]
     return shlex.join(words) + (" --message CLAIMED" if case.claimed else "")

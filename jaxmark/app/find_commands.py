@@ -102,6 +102,8 @@ def find_command(
         files = tuple(file.resolve() for file in key_files)
         plan = Plan(catalogue_file.resolve(), files, tuple(options.items()), release_programs)
         _find_many(plan, suspects, output, _workers(workers, scheduler), as_json)
+    if output is not None:
+        raise JaxmarkError("--output is for many suspects, a folder or a --list; leave it out, or use --json.")
     current().doing(f"comparing {suspect} with the originals")
     with opened(catalogue_file) as catalogue:
         verdict = Finder(catalogue, keys, alpha=alpha, bits=bits, depth=depth, align=align).find(suspect)

@@ -177,7 +177,10 @@ def budget_options(*, limits: bool = True, noise: float | None = None, noise_hel
             noise: float | None = None,
             **options: Any,
         ) -> Any:
-            return command(*args, budget=Budget(rms, visibility, dict(limits) or None, noise), **options)
+            tightest: dict[str, float] = {}
+            for metric, most in limits:
+                tightest[metric] = min(most, tightest.get(metric, most))
+            return command(*args, budget=Budget(rms, visibility, tightest or None, noise), **options)
 
         decorated = wrapped
         if noise_help:

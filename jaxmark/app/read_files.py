@@ -89,8 +89,14 @@ class FileReader:
             AlignmentError: if the suspect cannot be aligned with the original.
         """
         loaded = None if record is None else load_record(record)
+        # What is refused is refused before meshes are read.
         if loaded is not None:
-            loaded.caveats(self.key)  # refuses an edited one at once
+            loaded.caveats(self.key)
+        if loaded is not None and self.commitment is not None:
+            self.commitment.charges(loaded, claimed=self.message is not None)
+        for folder in (report, dossier):
+            if folder is not None and folder.exists() and not folder.is_dir():
+                raise JaxmarkError(f"{folder} is a file; name a folder.")
         if original is None:
             return self._outcome(self._read_blind(suspect, loaded), suspect, loaded)
         if loaded is not None and self.schemes and self.schemes[0] != loaded.scheme:
@@ -135,7 +141,7 @@ class FileReader:
         if nothing and detection.registration.deformed is not None and _has_skin(original):
             notes += ("If the suspect is in another pose of the original's skeleton, remove it by `jaxmark unpose`.",)
         outcome = self._outcome(detection._replace(notes=notes), suspect, loaded)
-        if dossier is not None and (reason := missing_proof(detection)):
+        if dossier is not None and (reason := missing_proof(detection, self.alpha)):
             outcome.values["dossier"] = None
             return outcome._replace(lines=(*outcome.lines, reason))
         if dossier is not None:
@@ -143,7 +149,10 @@ class FileReader:
             timestamped = outcome.values.get("log10_p_timestamped")
             files = (suspect, original, record)
             case = Case(
-                *files, mesh, mark, detection, self.message is not None, self.commitment, timestamped, self.obtained
+                *(*files, mesh, mark, detection, self.message is not None, self.commitment, timestamped),
+                obtained=self.obtained,
+                meshes=self.meshes,
+                schemes=self.schemes,
             )
             save_dossier(dossier, case)
             outcome.values["dossier"] = str(dossier)

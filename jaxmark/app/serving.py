@@ -7,6 +7,7 @@ wait, and the server rejects others.
 
 import asyncio
 import secrets
+import socket
 import tempfile
 from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
@@ -92,10 +93,14 @@ def serve_command(
     app = make_app(desk, most_megabytes * 2**20)
     settings = uvicorn.Config(app, host=_HOST, port=port, log_level="warning", server_header=False, access_log=False)
     server = uvicorn.Server(settings)
+    try:
+        listening = socket.create_server((_HOST, port))
+    except OSError as error:
+        raise JaxmarkError(f"The port {port} cannot be used: {error.strerror}; give another --port.") from None
     desk.begin()
-    with settings.bind_socket() as socket:
-        answer(False, {}, f"http://{_HOST}:{socket.getsockname()[1]}/ shows {catalogue_file}; Ctrl+C ends it")
-        server.run(sockets=[socket])
+    with listening as socket_:
+        answer(False, {}, f"http://{_HOST}:{socket_.getsockname()[1]}/ shows {catalogue_file}; Ctrl+C ends it")
+        server.run(sockets=[socket_])
 
 
 @dataclass

@@ -31,6 +31,7 @@ from jaxmark.geometry.pose import Points, Pose
 from jaxmark.watermark.coding.keys import Key, commitment
 from jaxmark.watermark.everyday import alternatives
 from jaxmark.watermark.evidence import ledger
+from jaxmark.watermark.evidence.detection import check_alpha
 from jaxmark.watermark.evidence.ledger import Charge
 from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.record import Record, is_recorded
@@ -229,8 +230,7 @@ class Finder(Generic[AnyOriginals]):
     ) -> None:
         if not keys:
             raise JaxmarkError("Reading marks needs a key; give at least one.")
-        if not 0 < alpha < 1:
-            raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+        check_alpha(alpha)
         if depth < 1:
             raise JaxmarkError(f"The depth must be at least 1, got {depth}.")
         if align not in get_args(Align):

@@ -39,8 +39,11 @@ def refuse_existing_pair(file: Path, record: Path, *, overwrite: bool, original:
     a file that refers to the original.
 
     Raises:
-        JaxmarkError: if one of them exists, and may not be replaced.
+        JaxmarkError: if one of them exists, and may not be replaced, or is in a folder that does not.
     """
+    for folder in (file.parent, record.parent):
+        if not folder.is_dir():
+            raise JaxmarkError(f"The folder {folder} does not exist.")
     came_along = not record.exists() and original is not None and _is_copy(file, original)
     refuse_existing(*([record] if came_along else [file, record]), overwrite=overwrite)
 

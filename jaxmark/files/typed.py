@@ -59,8 +59,10 @@ def normalise_names(names: Iterable[str]) -> list[str]:
     """Normalise names, and drop repeated ones.
 
     Raises:
-        JaxmarkError: if different names become the same; see also `normalise`.
+        JaxmarkError: if different names become the same, or they are one text; see also `normalise`.
     """
+    if isinstance(names, str):
+        raise JaxmarkError(f"Names are a list, not one text: give [{names!a}].")
     normalised: dict[str, str] = {}
     for name in names:
         first = normalised.setdefault(normalise(name), name)

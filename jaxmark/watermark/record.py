@@ -107,7 +107,13 @@ class Record:
         return {"": self}
 
     def caveats(self, key: bytes) -> tuple[str, ...]:
-        """Return none: unlike those of a scene, the record of one mesh always has a code, which `check` checks."""
+        """Return why readings are no proof: nothing, because the record of one mesh always has a code.
+
+        Raises:
+            JaxmarkError: if the code does not match, for this key.
+        """
+        if self.key == commitment(key):
+            self._check_code(key)
         return ()
 
     def to_json(self) -> str:
@@ -139,8 +145,7 @@ class Record:
             raise JaxmarkError(f"The record is of a {self.content}; {_READERS[self.content]} reads it.")
         if self.key != commitment(key):
             raise JaxmarkError("The key is not the one that the record commits to.")
-        if not hmac.compare_digest(self.code, self._code(key)):
-            raise JaxmarkError("The record was edited: its code does not match its fields. Use an unedited copy.")
+        self._check_code(key)
 
     def payload(self, key: bytes, bits: int | None = None) -> int:
         """Check the record of a message or a presence mark, and return its payload size.
@@ -201,6 +206,10 @@ class Record:
         fields = asdict(self)
         told = fields.pop("message_commitment")
         return {**fields, "told": told}
+
+    def _check_code(self, key: bytes) -> None:
+        if not hmac.compare_digest(self.code, self._code(key)):
+            raise JaxmarkError("The record was edited: its code does not match its fields. Use an unedited copy.")
 
     def _code(self, key: bytes) -> str:
         fields = canonical_json({name: value for name, value in self._stored().items() if name != "code"})

@@ -12,6 +12,7 @@ from jaxmark.app import read_files
 from jaxmark.files import limits
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.evidence.detection import Detection, Evidence
+from jaxmark.watermark.record import make_commitment
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -105,7 +106,7 @@ def test_where_nothing_was_found_another_reading_is_advised(
     """With a record, the reading without it, and the reverse, but only where it may find more."""
     nothing = Detection(None, Evidence(), None, np.zeros(1), None, "field")
     entry = SimpleNamespace(scheme="field", digest=lambda: "0")
-    record = SimpleNamespace(meshes={"": entry}, **vars(entry))
+    record = SimpleNamespace(meshes={"": entry}, caveats=lambda _: (), **vars(entry))
     monkeypatch.setattr(read_files, "read_blind", lambda *_, **__: nothing)
     monkeypatch.setattr(read_files, "load_record", lambda _: record)
     monkeypatch.setattr(read_files, "detection_values", lambda detection, *_: {"notes": detection.notes})
@@ -120,3 +121,13 @@ def test_a_suspect_is_refused_before_the_original_is_prepared(tmp_path: Path, mo
     reader = read_files.FileReader(KEY, 64, None)
     with pytest.raises(jm.JaxmarkError, match=r"Cannot read .*missing\.obj"):
         reader.read(tmp_path / "missing.obj", file_of(tmp_path, [100]))
+
+
+def test_what_records_say_is_checked_before_meshes_are_read(tmp_path: Path):
+    _, info = jm.watermark.embed_scene({"a": rough_sphere(400)}, b"", KEY, budget=2e-3)
+    (tmp_path / "record.json").write_text(info.record.to_json())
+    other = make_commitment(["0" * 64])
+    with pytest.raises(jm.JaxmarkError, match="not in the commitment"):
+        read_files.FileReader(KEY, None, None, commitment=other).read(
+            tmp_path / "absent.obj", tmp_path / "absent.obj", tmp_path / "record.json"
+        )

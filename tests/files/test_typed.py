@@ -97,3 +97,8 @@ def test_messages_that_cannot_be_seen_are_empty(text: str):
     refused = CliRunner().invoke(cli, ["embed", "a.ply", "b.ply", "--key", "owner.key", "--text", text])
     assert refused.exit_code == 2
     assert "the message is empty" in refused.output
+
+
+def test_one_text_is_no_list_of_names() -> None:
+    with pytest.raises(JaxmarkError, match="Names are a list, not one text"):
+        normalise_names("alice")

@@ -81,6 +81,16 @@ class Evidence(NamedTuple):
         )
 
 
+def check_alpha(alpha: float) -> None:
+    """Refuse what is no false-positive probability.
+
+    Raises:
+        JaxmarkError: if it is not in (0, 1).
+    """
+    if not 0 < alpha < 1:
+        raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+
+
 def _all_caveats(evidence: Sequence[Evidence]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(caveat for part in evidence for caveat in part.caveats))
 
@@ -316,7 +326,6 @@ class Detection(NamedTuple):
         Raises:
             JaxmarkError: if `alpha` is not in (0, 1).
         """
-        if not 0 < alpha < 1:
-            raise JaxmarkError(f"alpha is a probability and must be in (0, 1), got {alpha:g}.")
+        check_alpha(alpha)
         is_proof = allow_estimate or not self.evidence.caveats
         return is_proof and self.log10_p <= math.log10(alpha)

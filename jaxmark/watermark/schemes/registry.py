@@ -72,6 +72,8 @@ def get_nonblind(scheme: str | Scheme | BlindScheme) -> Scheme:
         JaxmarkError: if there is no scheme of that name, or it is blind.
     """
     if not isinstance(scheme, str | BlindScheme):
+        if not isinstance(scheme, Scheme):
+            raise JaxmarkError(f"A scheme is a name, or one of `jaxmark.watermark.schemes`; here, it is {scheme!r}.")
         return scheme
     name = name_of(scheme)
     if name not in SCHEMES:
