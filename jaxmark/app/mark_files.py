@@ -22,7 +22,7 @@ from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.everyday import SceneInfo, embed_scene
 from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, prepare
-from jaxmark.watermark.perception.budget import Budget
+from jaxmark.watermark.perception.budget import Bounds, Budget, excesses
 from jaxmark.watermark.perception.capacity import Survival
 from jaxmark.watermark.record import SceneRecord
 from jaxmark.watermark.schemes.passband import ADAPTIVE
@@ -30,6 +30,7 @@ from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, AnyScheme, name_o
 from jaxmark.watermark.tracing.tracer import make_tracer
 
 _MOST_NAMED = 5  # most meshes that a message lists by name
+_SLIGHT_ROUNDING = 0.005  # RMS of what rounding adds to a displacement, over its own, that moves no metric visibly
 
 
 def pick(scene: Scene, names: Sequence[str], path: Path) -> Scene:
@@ -143,6 +144,7 @@ def mark_file(
             )
         write_atomically(pair.record, info.record.to_json().encode())
     doing("measuring the displacement")
+    notes += _excess(prepared, result, written, budget.bounds_of(prepared))
     texture = load_texture(original)
     drift = None if texture is None else distortion.texture_drift(mesh, written, texture)
     moved = _moved(prepared, written)
@@ -251,6 +253,10 @@ def _mark_scene(
         f" the weakest mark survives {survival_text(least)}"
     )
     noted = [f"{name}: {note}" for name, info in info.meshes.items() for note in info.notes]
+    for name in info.meshes:
+        original = markers[name].original
+        excess = _excess(original, meshes[name], written[name], budget.bounds_of(original))
+        noted += [f"{name}: {note}" for note in excess]
     return FileOutcome(values, (text, *_unchanged(skipped), *noted, *notes))
 
 
@@ -273,6 +279,15 @@ def _unchanged(skipped: Mapping[str, str]) -> list[str]:
 def _without_caches(marker: Any) -> Any:
     """Copy a marker, which is a dataclass, without its cached values."""
     return replace(marker)
+
+
+def _excess(original: Original, exact: Mesh, written: Mesh, bounds: Bounds) -> tuple[str, ...]:
+    """Say which bounds a written mesh exceeds, because the numbers of its file are rounded; nothing if it does not."""
+    intended, actual = (shift_of(original, mesh)[original.used] for mesh in (exact, written))
+    if distortion.rms(actual - intended) <= _SLIGHT_ROUNDING * distortion.rms(intended):
+        return ()
+    found = excesses(original, written, bounds)
+    return (f"after rounding to the numbers of the file, {' and '.join(found)}",) if found else ()
 
 
 def _moved(original: Original, written: Mesh) -> dict[str, float]:

@@ -225,6 +225,10 @@ class FileReader:
     def _names(self, scene: Scene, original: Path, record: SceneRecord | None) -> list[str]:
         """Return the names of the meshes to read; the record must have them, if there is one."""
         marked = scene.meshes if record is None else record.meshes
+        if not any(find_name(name, {**scene.meshes, **scene.skipped}) for name in marked):
+            raise JaxmarkError(
+                f"{original} has no mesh of the record, such as {next(iter(marked))!r}; give the file that was marked."
+            )
         for name in self.meshes:
             if find_name(name, scene.meshes) and not find_name(name, marked):
                 names = ", ".join(map(repr, marked))

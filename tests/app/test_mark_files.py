@@ -39,9 +39,13 @@ def marked(source: Path, key: Key) -> mark_files.FileOutcome:
 def test_numbers_coarser_than_the_mark_are_read_back(tmp_path: Path, key: Key):
     source = objects(tmp_path / "coarse.obj", 2, bumpy_sphere(3))
     outcome = marked(source, key)
-    (note,) = outcome.values["notes"]
+    note, excess = outcome.values["notes"]
     assert note.startswith("rounding to the numbers of the file changes the displacement by ")
-    assert outcome.lines[-1] == note
+    assert excess.startswith("after rounding to the numbers of the file, the RMS displacement is ")
+    assert outcome.lines[-2:] == (note, excess)
+    written = jm.load_mesh(tmp_path / "marked-coarse.obj")
+    rms = jm.distortion.compare(jm.load_mesh(source), written, ["rms"]).rms
+    assert excess.endswith(f"displacement is {rms:.3g}, above {BUDGET.rms:.3g}")
     found = jm.detect(jm.load_mesh(tmp_path / "marked-coarse.obj"), original=jm.load_mesh(source), key=key, message=b"")
     assert found.detected()
     with pytest.raises(JaxmarkError, match=r"0\.1 apart, so that rounding takes .* % of that; write its"):

@@ -50,6 +50,7 @@ _FACES_NAMED = 3
 _FIRST_OF_EDGES = 0.04  # displacement over the mean edge that is tried first: limits usually allow about as much
 _FIRST_OF_CLOUDS = 2e-4  # displacement of point clouds that is tried first, in diagonals
 _MIN_LIMIT_SHARE = 0.99  # share of a limit that must be reached
+_SLIGHT_EXCESS = 1e-3  # share of a limit by which it may be exceeded unsaid
 _SECANT_STEPS = 10  # number of secant steps, after which bisection follows, which cannot fail
 
 
@@ -216,6 +217,24 @@ def reference_of(original: Original) -> distortion.Reference:
 
 def _reference(original: Original) -> distortion.Reference:
     return distortion.Reference(original.mesh)
+
+
+def excesses(original: Original, mesh: Mesh, bounds: Bounds) -> list[str]:
+    """Measure a displaced mesh, and describe each bound that it exceeds by more than 0.1 %, as after rounding.
+
+    Raises:
+        JaxmarkError: see `jaxmark.distortion.measure`.
+    """
+    measured = reference_of(original).measure(mesh, tuple(bounds.limits))
+    values = [(name_of(metric), measured[metric], limit) for metric, limit in bounds.limits.items()]
+    if bounds.rms is not None:
+        rms = distortion.DisplacementSize.of(shift_of(original, mesh)[original.used]).rms
+        values.append(("the RMS displacement", rms, bounds.rms))
+    return [
+        f"{name} is {value:.3g}, above {limit:.3g}"
+        for name, value, limit in values
+        if value is not None and value > (1 + _SLIGHT_EXCESS) * limit
+    ]
 
 
 def displace_within(
