@@ -582,10 +582,13 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, as_json: bool) -> None:
     """Compute the largest payload, in bits, that MESH carries so that it survives noise and the loss of vertices.
 
-    Of a file of several meshes, which are marked one by one, it is that of the mesh that carries most.
+    Of a file of several meshes, which are marked one by one, it is that of the mesh that carries most. All objects of
+    an OBJ file count as one mesh.
     """
     scene = load_scene(mesh)
-    meshes = scene.meshes if len(scene.meshes) + len(scene.skipped) > 1 else {"": load_mesh(mesh)}
+    # The objects of an OBJ file may also be marked as one mesh, which carries most.
+    is_one = len(scene.meshes) + len(scene.skipped) == 1 or mesh.suffix.lower() == ".obj"
+    meshes = {"": load_mesh(mesh)} if is_one else scene.meshes
     each = {}
     for name, part in meshes.items():
         current().doing(f"computing the capacity of {name or mesh}")
