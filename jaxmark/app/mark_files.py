@@ -254,8 +254,8 @@ def _mark_scene(
     )
     noted = [f"{name}: {note}" for name, info in info.meshes.items() for note in info.notes]
     for name in info.meshes:
-        original = markers[name].original
-        excess = _excess(original, meshes[name], written[name], budget.bounds_of(original))
+        prepared: Original = markers[name].original
+        excess = _excess(prepared, meshes[name], written[name], budget.bounds_of(prepared))
         noted += [f"{name}: {note}" for note in excess]
     return FileOutcome(values, (text, *_unchanged(skipped), *noted, *notes))
 
