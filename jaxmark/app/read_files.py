@@ -89,16 +89,15 @@ class FileReader:
             AlignmentError: if the suspect cannot be aligned with the original.
         """
         loaded = None if record is None else load_record(record)
-        # What is refused is refused before meshes are read.
-        if loaded is not None:
-            loaded.caveats(self.key)
+        # Refusals come before meshes are read.
+        caveats = () if loaded is None else loaded.caveats(self.key)
         if loaded is not None and self.commitment is not None:
             self.commitment.charges(loaded, claimed=self.message is not None)
         for folder in (report, dossier):
             if folder is not None and folder.exists() and not folder.is_dir():
                 raise JaxmarkError(f"{folder} is a file; name a folder.")
         if original is None:
-            return self._outcome(self._read_blind(suspect, loaded), suspect, loaded)
+            return self._outcome(_with_caveats(self._read_blind(suspect, loaded), caveats), suspect, loaded)
         if loaded is not None and self.schemes and self.schemes[0] != loaded.scheme:
             raise JaxmarkError(
                 f"--scheme {self.schemes[0]} contradicts the record, whose scheme is {loaded.scheme}; leave it out."
@@ -130,7 +129,7 @@ class FileReader:
         blind_schemes = [BLIND_SCHEMES[name] for name in self.schemes[1:]]
         detection = with_blind(detection, blind_schemes, mesh, self.key, mark, self.message)
         charges = *self.charges, *ledger.selection(1, len(marked))
-        detection = detection._replace(evidence=detection.evidence.charged(*charges))
+        detection = _with_caveats(detection._replace(evidence=detection.evidence.charged(*charges)), caveats)
         if report is not None:
             self.doing("drawing the report")
             save_report(report, mark.original, mesh, detection.registration)
@@ -161,9 +160,6 @@ class FileReader:
     def _outcome(self, detection: Detection, suspect: Path, record: Record | SceneRecord | None) -> FileOutcome:
         """Describe a detection, with the bound that holds if the commitment is older than the suspect."""
         timestamped = None
-        if record is not None:
-            caveats = dict.fromkeys((*record.caveats(self.key), *detection.evidence.caveats))
-            detection = detection._replace(evidence=detection.evidence._replace(caveats=tuple(caveats)))
         if record is not None and self.commitment is not None:
             charges = self.commitment.charges(record, claimed=self.message is not None)
             timestamped = detection.evidence.charged(*charges)
@@ -225,7 +221,8 @@ class FileReader:
     def _names(self, scene: Scene, original: Path, record: SceneRecord | None) -> list[str]:
         """Return the names of the meshes to read; the record must have them, if there is one."""
         marked = scene.meshes if record is None else record.meshes
-        if not any(find_name(name, {**scene.meshes, **scene.skipped}) for name in marked):
+        known = {**scene.meshes, **scene.skipped}
+        if not any(find_name(name, known) for name in marked):
             raise JaxmarkError(
                 f"{original} has no mesh of the record, such as {next(iter(marked))!r}; give the file that was marked."
             )
@@ -302,6 +299,12 @@ def _distinct(names: Sequence[str], meshes: Mapping[str, Mesh]) -> list[str]:
     for name in names:
         first.setdefault(digest(meshes[name]), name)
     return list(first.values())
+
+
+def _with_caveats(detection: Detection, caveats: tuple[str, ...]) -> Detection:
+    """Add the reasons why a record makes a detection no proof."""
+    evidence = detection.evidence
+    return detection._replace(evidence=evidence._replace(caveats=(*caveats, *evidence.caveats)))
 
 
 def _has_skin(path: Path) -> bool:

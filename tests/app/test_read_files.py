@@ -12,7 +12,7 @@ from jaxmark.app import read_files
 from jaxmark.files import limits
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark.evidence.detection import Detection, Evidence
-from jaxmark.watermark.record import make_commitment
+from jaxmark.watermark.record import SceneRecord, make_commitment
 from tests.samples import rough_sphere
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -131,3 +131,17 @@ def test_what_records_say_is_checked_before_meshes_are_read(tmp_path: Path):
         read_files.FileReader(KEY, None, None, commitment=other).read(
             tmp_path / "absent.obj", tmp_path / "absent.obj", tmp_path / "record.json"
         )
+
+
+def test_a_record_without_a_code_gives_no_dossier(tmp_path: Path):
+    mesh = rough_sphere(800)
+    marked, info = jm.watermark.embed_scene({"a": mesh}, b"", KEY, budget=2e-3)
+    for name, one in (("original", mesh), ("marked", marked["a"])):
+        jm.save_mesh(one, tmp_path / f"{name}.ply")
+    meshes = {"mesh": info.record.meshes["a"]}
+    (tmp_path / "record.json").write_text(SceneRecord(meshes).to_json())
+    files = (tmp_path / "marked.ply", tmp_path / "original.ply", tmp_path / "record.json")
+    outcome = read_files.FileReader(KEY, None, None).read(*files, dossier=tmp_path / "case")
+    assert (outcome.values["detected"], outcome.values["estimate"], outcome.values["dossier"]) == (False, True, None)
+    assert "There is no dossier of an estimate: the record of the scene has no code" in outcome.lines[-1]
+    assert not (tmp_path / "case").exists()
