@@ -582,8 +582,8 @@ def compare(original: Path, distorted: Path, pictures: bool, as_json: bool) -> N
 def capacity_command(mesh: Path, budget: Budget, coverage: float, scheme: str, as_json: bool) -> None:
     """Compute the largest payload, in bits, that MESH carries so that it survives noise and the loss of vertices.
 
-    Of a file of several meshes, which are marked one by one, it is that of the mesh that carries most. All objects of
-    an OBJ file count as one mesh.
+    The meshes of a file are marked one by one, so the payload is that of the mesh that carries most. All objects of an
+    OBJ file count as one mesh.
     """
     scene = load_scene(mesh)
     # The objects of an OBJ file may also be marked as one mesh, which carries most.

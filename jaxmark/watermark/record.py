@@ -309,7 +309,7 @@ class SceneRecord:
     def caveats(self, key: bytes) -> tuple[str, ...]:
         """Return why readings are no proof: without a code, meshes may have been left out of the record.
 
-        Whoever chooses the meshes after the suspect exists can choose those that happen to agree with it.
+        Meshes that are chosen after the suspect exists can be those that happen to agree with it.
 
         Raises:
             JaxmarkError: if the code does not match, for this key.
