@@ -264,7 +264,7 @@ def with_blind(
 
     Args:
         found: the detection of the non-blind mark.
-        schemes: the schemes of the blind marks; a record does not name them, so their choice is charged.
+        schemes: the schemes of the blind marks.
         suspect: see `detect`.
         key: see `detect`.
         mark: the non-blind mark.
@@ -274,11 +274,7 @@ def with_blind(
         JaxmarkError: see `detect`.
     """
     blind = [read_blind(suspect, key, bits=mark.bits, message=message, schemes=[scheme]) for scheme in schemes]
-    united = unite(mark, found, blind) if blind else found
-    if mark.record is None:
-        return united
-    names = " and ".join(sorted(scheme.name for scheme in schemes)) or "none"
-    return united._replace(evidence=united.evidence.charged(ledger.BESIDE.charge(names)))
+    return unite(mark, found, blind)
 
 
 class SceneInfo(NamedTuple):

@@ -39,6 +39,7 @@ from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, S
 from jaxmark.watermark.record import Record, commit, is_recorded
 from jaxmark.watermark.schemes.passband import choose_pass_band
 from jaxmark.watermark.schemes.registry import (
+    BLIND_SCHEMES,
     DEFAULT_SCHEME,
     SCHEMES,
     AnyScheme,
@@ -384,7 +385,8 @@ class BlindMarker:
         """See `Marker`, and `jaxmark.watermark.blind.reading.read`."""
         if message is not None:
             check_size(message, self.bits)
-        return blind_reading.read(registered, self.key, self.bits, self.scheme, message)
+        found = blind_reading.read(registered, self.key, self.bits, self.scheme, message)
+        return blind_reading.best_of([found], ledger.BLIND_SCHEME, len(BLIND_SCHEMES))
 
     def detect(self, suspect: Mesh, message: bytes | None = None) -> Detection:
         """See `Marker`."""
@@ -582,13 +584,22 @@ def unite(mark: Mark, nonblind: Detection, blind: Sequence[Detection]) -> Detect
     """Unite the detections of all marks of a mesh, whose signs are independent, into one non-blind detection.
 
     It is about one message: that of the non-blind mark, or else the first that was decoded. Marks of other messages are
-    not counted.
+    not counted. A record does not name the other marks, so that their choice is charged.
 
     Args:
         mark: the non-blind mark, whose record may commit to a message.
         nonblind: its detection.
-        blind: the detections of the other marks.
+        blind: the detections of the other marks, if any.
     """
+    united = _product(mark, nonblind, blind) if blind else nonblind
+    if mark.record is None:
+        return united
+    names = " and ".join(sorted(detection.scheme for detection in blind)) or "none"
+    return united._replace(evidence=united.evidence.charged(ledger.BESIDE.charge(names)))
+
+
+def _product(mark: Mark, nonblind: Detection, blind: Sequence[Detection]) -> Detection:
+    """Unite the detections of at least two marks; see `unite`."""
     detections = (nonblind, *blind)
     message = next((about for each in detections if (about := _subject(each)) is not None), None)
     agreeing = [_subject(detection) in (None, message) for detection in detections]

@@ -471,6 +471,7 @@ def test_marks_of_different_messages_are_not_united(sphere: Mesh, key: jm.Key):
     alone = unite(mark, found("keyed", None, 0.0), [local])
     assert (alone.message, alone.scheme, alone.recorded) == (b"no", "local", False)
     assert ledger.MARKS_MESSAGE.charge("another") in alone.evidence.charges
-    beside = alone.evidence.charged(ledger.BESIDE.charge("local"))
-    assert ledger.is_charged_along_a_path(beside.charges)
+    assert alone.evidence.charges[0] == ledger.BESIDE.charge("local")
+    assert unite(mark, keyed, []).evidence.charges[0] == ledger.BESIDE.charge("none")
+    assert ledger.is_charged_along_a_path(alone.evidence.charges)
     assert "another message than the one in the record" in alone.notes[-1]

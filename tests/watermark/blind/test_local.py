@@ -17,7 +17,7 @@ from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
 from jaxmark.watermark.evidence import ledger
-from jaxmark.watermark.markers import unite
+from jaxmark.watermark.markers import make_blind_marker, prepare, unite
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
@@ -125,6 +125,8 @@ def test_all_blind_schemes_are_tried_and_paid_for(marked, key: jm.Key):
     assert found.log10_p == pytest.approx(alone.log10_p)
     (charge,) = [one for one in found.evidence.charges if one.choice == ledger.BLIND_SCHEME.name]
     assert charge.log10 == pytest.approx(math.log10(len(BLIND_SCHEMES)))
+    marker = make_blind_marker(mesh, key, bits=8, scheme=LocalScheme())
+    assert marker.detect(mesh).log10_p == pytest.approx(alone.log10_p)
 
 
 @pytest.mark.slow
@@ -161,6 +163,8 @@ def test_several_marks_are_read_each_alone_and_united(key: jm.Key):
     informed = jm.detect(suspect, key=key, message=MESSAGE, original=mesh)
     both = jm.detect(suspect, key=key, message=MESSAGE, original=mesh, scheme=schemes)
     assert both.log10_p == pytest.approx(unite(jm.make_marker(mesh, key, bits=16), informed, [blind]).log10_p)
+    by_marker = prepare(mesh, key, 8, schemes).detect(suspect, MESSAGE)
+    assert by_marker.parts["local"].log10_p == pytest.approx(both.parts["local"].log10_p)
     assert both.evidence.log10_p_unfloored < min(one.evidence.log10_p_unfloored for one in (informed, blind))
     nats = -(informed.log10_p + blind.log10_p) * math.log(10)
     assert both.log10_p == pytest.approx(max(-77, (math.log1p(nats) - nats) / math.log(10)))
