@@ -24,7 +24,9 @@ SPACING = 3.4  # spacing of the lattice, in widths of the narrow Gaussian
 WIDER = 2.0  # width of the wide Gaussian over the narrow one
 _CUT = 3.2  # widths of the wide Gaussian at which it is cut off
 REACH = _CUT * WIDER  # distance, in widths of the narrow Gaussian, beyond which nothing changes a value
-_PIECE_AREA, _PIECE_SIDE = 0.2, 0.35  # largest size of pieces: in squared widths, and widths, of the narrow Gaussian
+# Largest size of pieces: in squared widths, and widths, of the narrow Gaussian. If they may be longer, subdividing the
+# faces of a CAD model can change its values by a quarter of a step.
+_PIECE_AREA, _PIECE_LENGTH, _PIECE_SIDE = 0.15, 0.7, 0.35
 _GROUP = 256  # pieces in a group
 _NO_PIECE = _NO_ANCHOR = 2**31 - 1  # the index that padding belongs to
 _TINY = 1e-12  # area below which there is no surface
@@ -144,33 +146,95 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     areas = np.linalg.norm(normals, axis=1) / 2
     nonempty = areas > 0
     faces, normals, areas = faces[nonempty], normals[nonempty], areas[nonempty]
+    corners = vertices[faces]
     sides = np.maximum(np.ceil(np.sqrt(areas / (_PIECE_AREA * width**2))), 1)
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    slices = np.maximum(np.ceil(longest / (_PIECE_LENGTH * width * sides)), 1)
     _check(float(np.sum(sides**2)) - len(sides), _MAX_SAMPLES)
-    count = sides.astype(np.int64) ** 2
-    face = np.repeat(np.arange(len(faces)), count)
-    shares = _centres(np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count), sides[face])
-    points = np.einsum("sk,skc->sc", shares, vertices[faces[face]])
+    # A hundred thousand long needles would have too many slices; their total area is small, so fewer will do.
+    slices = np.maximum(np.floor(slices * min(1, _MAX_SAMPLES / np.sum(sides**2 * slices))), 1)
+    face, shares, part = _samples(corners, sides.astype(np.int64), slices.astype(np.int64))
+    points = np.einsum("sk,skc->sc", shares, corners[face])
     # Pieces do not mix sheets: the normals of each have the same signs in all coordinates.
     cube = np.floor(points / (_PIECE_SIDE * width)).astype(np.int64)
     keys = np.concatenate([cube, normals[face] > 0], axis=1)
     _, piece = np.unique(keys, axis=0, return_inverse=True)
     order = np.argsort(piece.ravel(), kind="stable")
     padding = np.zeros(int(piece.max(initial=0)) + 1, bool)
-    return Pieces(faces[face][order], shares[order], 1 / count[face][order], piece.ravel()[order], padding)
+    return Pieces(faces[face][order], shares[order], part[order], piece.ravel()[order], padding)
+
+
+def _samples(
+    corners: Float64[np.ndarray, "faces 3 3"], sides: Int64[np.ndarray, " faces"], slices: Int64[np.ndarray, " faces"]
+) -> tuple[Int64[np.ndarray, " samples"], Float64[np.ndarray, "samples 3"], Float64[np.ndarray, " samples"]]:
+    """Cut faces into sides² equal triangles, and each of these across its length into slices of equal width.
+
+    Slices do not depend on the order of the corners: they are perpendicular to the triangle's main axis.
+
+    Returns:
+        For each slice the index of its face, the barycentric coordinates of its centre, and its share of the face.
+    """
+    first = np.cumsum(slices) - slices  # index of the first slice of each face's triangles
+    centre, share = np.full((int(slices.sum()), 3), 1 / 3), np.ones(int(slices.sum()))
+    is_cut = slices > 1
+    rows = np.repeat(is_cut, slices)
+    centre[rows], share[rows] = _slices(corners[is_cut], slices[is_cut])
+    count = sides**2 * slices
+    face = np.repeat(np.arange(len(sides)), count)
+    triangle, index = np.divmod(np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count), slices[face])
+    middle, turned = _centres(triangle, sides[face])
+    slice_ = first[face] + index
+    away = np.where(turned, -1, 1)[:, None] * (centre[slice_] - 1 / 3) / sides[face][:, None]
+    return face, middle + away, share[slice_] / sides[face] ** 2
 
 
 def _centres(
-    index: Int64[np.ndarray, " samples"], sides: Float64[np.ndarray, " samples"]
-) -> Float64[np.ndarray, "samples 3"]:
+    index: Int64[np.ndarray, " triangles"], sides: Int64[np.ndarray, " triangles"]
+) -> tuple[Float64[np.ndarray, "triangles 3"], Bool[np.ndarray, " triangles"]]:
     """Compute the barycentric coordinates of the centres of the sides² equal triangles that a triangle is cut into.
 
     They do not depend on the order of the triangle's corners, and their mean of any linear function is exact. Row k
     below the first corner has 2k + 1 triangles, every other one upside down.
+
+    Returns:
+        The centres, and which of the triangles are upside down.
     """
     row = np.floor(np.sqrt(index))
     pair, upside_down = np.divmod(index - row**2, 2)
     second, third = pair + (1 + upside_down) / 3, row - pair + (1 - 2 * upside_down) / 3
-    return np.stack([sides - second - third, second, third], axis=1) / sides[:, None]
+    return np.stack([sides - second - third, second, third], axis=1) / sides[:, None], upside_down == 1
+
+
+def _slices(
+    corners: Float64[np.ndarray, "faces 3 3"], count: Int64[np.ndarray, " faces"]
+) -> tuple[Float64[np.ndarray, "slices 3"], Float64[np.ndarray, " slices"]]:
+    """Cut triangles across their length into slices of equal width.
+
+    Returns:
+        For each slice the barycentric coordinates of its centre, and its share of the triangle's area.
+    """
+    middle = corners - corners.mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.einsum("fki,fkj->fij", middle, middle))
+    along = np.einsum("fkc,fc->fk", middle, axes[:, :, 2])
+    order = np.argsort(along, axis=1)
+    face = np.repeat(np.arange(len(count)), count)
+    low, peak, high = np.take_along_axis(along, order, axis=1)[face].T
+    step = (high - low) / count[face]
+    index = np.arange(len(face)) - np.repeat(np.cumsum(count) - count, count)
+
+    def below(place: Float64[np.ndarray, " slices"]) -> Float64[np.ndarray, "slices 4"]:
+        """Moment in barycentric coordinates, and area, of the part of a triangle below a place along its axis."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            near, far = (place - low) / (peak - low), (place - low) / (high - low)
+            lower = near * far * np.stack([1 - (near + far) / 3, near / 3, far / 3, np.ones_like(far)])
+            near, far = np.where(high > peak, (high - place) / (high - peak), 0), (high - place) / (high - low)
+            upper = near * far * np.stack([far / 3, near / 3, 1 - (near + far) / 3, np.ones_like(far)])
+        whole = np.array([1 / 3, 1 / 3, 1 / 3, 1.0])
+        return np.where(place[:, None] < peak[:, None], lower.T, whole - upper.T)
+
+    between = below(np.minimum(low + step * (index + 1), high)) - below(low + step * index)
+    centre = between[:, :3] / between[:, 3:]
+    return np.take_along_axis(centre, np.argsort(order, axis=1)[face], axis=1), between[:, 3]
 
 
 @jax.jit

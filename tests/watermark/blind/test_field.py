@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.app import mark_files
-from jaxmark.geometry.mesh import Mesh
+from jaxmark.geometry.mesh import Mesh, make_mesh
 from jaxmark.geometry.surfaces import surface_moments, volume_moments
 from jaxmark.spectral.graphs import from_mesh
 from jaxmark.watermark import EmbedInfo, FieldScheme
@@ -123,6 +123,17 @@ def test_values_of_coarse_surfaces_do_not_depend_on_how_they_are_cut(other: str,
     faces = np.asarray(copy.faces)
     rolled = np.where(np.arange(len(faces))[:, None] % 2, faces, np.roll(faces, 1, axis=1))
     assert change_of_values(coarse, copy._replace(faces=rolled)) < most
+
+
+def test_values_do_not_depend_on_how_long_and_thin_faces_are_cut():
+    around, along = 400, 12
+    height, angle = np.meshgrid(np.linspace(0, 1, along), 2 * np.pi * np.arange(around) / around, indexing="ij")
+    radius = 0.3 + 0.1 * height + 0.04 * np.sin(3 * angle + 4 * height)
+    points = np.stack([radius * np.cos(angle), 0.8 * radius * np.sin(angle), height], axis=-1).reshape(-1, 3)
+    below = np.arange((along - 1) * around).reshape(along - 1, around)
+    quads = np.stack([below, np.roll(below, -1, axis=1), np.roll(below, -1, axis=1) + around, below + around], axis=-1)
+    mesh = make_mesh(points, quads[..., [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3))
+    assert change_of_values(mesh, turned(jm.attack(mesh, "midpoint", 1, seed=0))) < 1e-3
 
 
 @pytest.mark.slow
