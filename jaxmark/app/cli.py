@@ -304,13 +304,16 @@ def detect_command(
     check_alpha(alpha)
     named = schemes or ()
     blind = [name for name in named if name in BLIND_SCHEMES]
-    if original is None or len(named) == len(blind) == 1:
+    if len(named) == len(blind) == 1 and (original, align, report, dossier) != (None, "auto", None, None):
+        raise JaxmarkError(
+            f"The scheme {blind[0]!r} is read without the original; leave out --original, --align, --report and"
+            " --dossier."
+        )
+    if original is None:
         if named and not blind:
             raise JaxmarkError(f"The scheme {named[0]!r} is not blind; give --original.")
         if align != "auto" or report is not None or dossier is not None:
-            way = "give --original" if original is None else "leave them out"
-            raise JaxmarkError(f"--align, --report and --dossier are for non-blind reading; {way}.")
-        original = None
+            raise JaxmarkError("--align, --report and --dossier are for non-blind reading; give --original.")
     reader = FileReader(
         read_key(key_file),
         0 if presence else bits,

@@ -22,8 +22,8 @@ from jaxtyping import Float64
 from jaxmark.alignment.original import Original
 from jaxmark.alignment.result import Alignment
 from jaxmark.app.output import make_folder, power
-from jaxmark.errors import JaxmarkError, require
-from jaxmark.files.atomic import file_hash, write_atomically
+from jaxmark.errors import JaxmarkError
+from jaxmark.files.atomic import file_hash, replacing, write_atomically
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.plot import View, draw, save_views
 from jaxmark.plot.figures import fill_template
@@ -105,12 +105,12 @@ def save_dossier(folder: Path, case: Case) -> None:
     """
     if reason := missing_proof(case.found):
         raise JaxmarkError(reason)
-    require("jinja2", "plot")  # checked before the pictures are drawn, which takes longer
     facts = _facts(case)
     make_folder(folder)
     text = fill_template("jaxmark.app", "dossier.html", **facts, rounded_up=rounded_up, pictures=_draw_sides(case))
-    write_atomically(folder / "dossier.json", (json.dumps(facts, indent=2) + "\n").encode())
-    write_atomically(folder / "dossier.html", text.encode())
+    with replacing(folder / "dossier.html") as page, replacing(folder / "dossier.json") as data:
+        write_atomically(data, (json.dumps(facts, indent=2) + "\n").encode())
+        write_atomically(page, text.encode())
 
 
 def _facts(case: Case) -> dict[str, Any]:

@@ -13,7 +13,7 @@ from jaxmark.app.dossier import Case, missing_proof, save_dossier, save_report
 from jaxmark.app.mark_files import pick
 from jaxmark.app.output import VERDICTS, FileOutcome, Status, detection_lines, detection_status, detection_values
 from jaxmark.app.progress import Doing, quietly
-from jaxmark.errors import AlignmentError, JaxmarkError
+from jaxmark.errors import AlignmentError, JaxmarkError, require
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.files.programs import release_programs
 from jaxmark.files.typed import find_name
@@ -96,6 +96,10 @@ class FileReader:
         for folder in (report, dossier):
             if folder is not None and folder.exists() and not folder.is_dir():
                 raise JaxmarkError(f"{folder} is a file; name a folder.")
+            if folder is not None:
+                require("matplotlib", "plot")
+        if dossier is not None:
+            require("jinja2", "plot")
         if original is None:
             return self._outcome(_with_caveats(self._read_blind(suspect, loaded), caveats), suspect, loaded)
         if loaded is not None and self.schemes and self.schemes[0] != loaded.scheme:

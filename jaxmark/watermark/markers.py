@@ -303,13 +303,7 @@ class BlindMarker:
         self, message: bytes, budget: BudgetLike = None, *, read_back: ReadBack = "now"
     ) -> tuple[Mesh, EmbedInfo]:
         """See `Marker`."""
-        budget = Budget.of(budget)
         marked, info = self.write(message, budget, to_be_read=read_back != "never")
-        if budget.noise is not None and info.survives.whole < budget.noise:
-            raise JaxmarkError(
-                f"This mark would survive noise of {info.survives.whole:.2g}, less than {budget.noise:g}; use a larger"
-                " budget, a shorter message or another scheme."
-            )
         if read_back == "now":
             with info.explained():
                 self.with_record(info.record).check(marked, message)
@@ -323,8 +317,13 @@ class BlindMarker:
         *,
         to_be_read: bool = True,
     ) -> tuple[Mesh, EmbedInfo]:
-        """Write a message as far as a budget allows; limits are measured against `reference`, if given."""
-        choices, bounds = self.writer.choices, Budget.of(budget).bounds_of(self.original)
+        """Write a message as far as a budget allows; limits are measured against `reference`, if given.
+
+        Raises:
+            JaxmarkError: see `jaxmark.watermark.everyday.embed`.
+        """
+        budget = Budget.of(budget)
+        choices, bounds = self.writer.choices, budget.bounds_of(self.original)
         word = blind_reading.codeword(message, choices)
         written = self.writer.write(word, bounds, self.bits, reference, to_be_read=to_be_read)
         record = Record(
@@ -342,6 +341,11 @@ class BlindMarker:
             message_commitment=commit(message, choices) if message else "",
         ).sealed(self.key)
         survives = self.writer.survives(written.plan, self.bits)
+        if budget.noise is not None and survives.whole < budget.noise:
+            raise JaxmarkError(
+                f"The mark of {self.scheme.name!r} would survive noise of {survives.whole:.2g}, less than"
+                f" {budget.noise:g}; use a larger budget, a shorter message or another scheme."
+            )
         notes = (written.note,) if written.note else ()
         return written.mesh, EmbedInfo(written.moved.rms, written.moved.max, record.beta, record, survives, notes)
 
@@ -439,7 +443,7 @@ class CombinedMarker:
             rms = None if place == len(self.schemes) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
             marked, blind_info = marker.write(
-                message, Budget(rms=rms, limits=limits), reference, to_be_read=read_back != "never"
+                message, Budget(rms=rms, noise=budget.noise, limits=limits), reference, to_be_read=read_back != "never"
             )
             survives.append(blind_info.survives)
             notes += blind_info.notes

@@ -225,10 +225,9 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("embed", "model.ply", "no/where.ply", *mark), "folder no"),
         (("embed", "model.ply", "out.ply", *mark, "--record", "no/where.json"), "no"),
         (("detect", "absent.ply", *DETECT, "--report", "model.ply"), "model.ply is a file; name a folder"),
-        (
-            ("detect", "absent.ply", "--original", "a.ply", "--key", "owner.key", "--scheme", "local", "--report", "r"),
-            "leave them out",
-        ),
+        (("detect", "absent.ply", *DETECT, "--scheme", "local"), "read without the original; leave out --original"),
+        (("detect", "absent.ply", "--key", "owner.key", "--scheme", "local", "--report", "r"), "leave out .* --report"),
+        (("detect", "absent.ply", "--key", "owner.key", "--report", "r"), "non-blind reading; give --original"),
         (("embed", "model.ply", "out.ply", *mark, "--budget", "1e-9", "--noise", "0"), "numbers are .* apart"),
         (("embed", "model.ply", "out.ply", *mark, "--budget", "nan"), "budget"),
         (("embed", "model.ply", "out.ply", *mark, "--scheme", "magic"), "magic"),

@@ -16,8 +16,10 @@ from jaxmark.watermark import EmbedInfo, LocalScheme
 from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
+from jaxmark.watermark.blind.writing import Writer
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.markers import make_blind_marker, prepare, unite
+from jaxmark.watermark.perception.capacity import Survival
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
 from tests.app.test_cli import Workshop
@@ -151,6 +153,12 @@ def test_equal_surroundings_count_once(key: jm.Key):
     # Far from the origin, coordinates have fewer digits, and the median is another one.
     assert readings[1].anchors == readings[0].anchors
     np.testing.assert_allclose(readings[1].square, readings[0].square, rtol=0.01)
+
+
+def test_the_noise_to_survive_is_demanded_of_each_of_several_marks(shape: Mesh, key: jm.Key, monkeypatch):
+    monkeypatch.setattr(Writer, "survives", lambda *_: Survival(1e-4, 0.0))
+    with pytest.raises(jm.JaxmarkError, match=r"'local' would survive noise of 0\.0001, less than 0\.001"):
+        jm.embed(shape, MESSAGE, key, budget=jm.Budget(rms=2e-3, noise=1e-3), scheme=("keyed", "local"))
 
 
 @pytest.mark.slow
