@@ -152,7 +152,7 @@ def cut(mesh: Mesh, width: float) -> Pieces:
     slices = np.maximum(np.ceil(longest / (_PIECE_LENGTH * width * sides)), 1)
     _check(float(np.sum(sides**2)) - len(sides), _MAX_SAMPLES)
     # A hundred thousand long needles would have too many slices; their total area is small, so fewer will do.
-    slices = np.maximum(np.floor(slices * min(1, _MAX_SAMPLES / np.sum(sides**2 * slices))), 1)
+    slices = np.maximum(np.floor(slices * min(1, _MAX_SAMPLES / max(np.sum(sides**2 * slices), 1))), 1)
     face, shares, part = _samples(corners, sides.astype(np.int64), slices.astype(np.int64))
     points = np.einsum("sk,skc->sc", shares, corners[face])
     # Pieces do not mix sheets: the normals of each have the same signs in all coordinates.
