@@ -21,11 +21,13 @@ def random_key(seed: Randomness) -> PRNGKeyArray:
     """Make a JAX random key from a seed; a key is returned unchanged, and a NumPy generator draws a key.
 
     Raises:
-        JaxmarkError: if the seed is neither a whole number, nor a key, nor a generator.
+        JaxmarkError: if the seed is neither a whole number of at least 0, nor a key, nor a generator.
     """
     if isinstance(seed, np.random.Generator):
         return jax.random.key(int(seed.integers(2**31)))
     if isinstance(seed, int | np.integer):
+        if seed < 0:
+            raise JaxmarkError(f"A seed must not be negative, got {seed}.")
         return jax.random.key(seed)
     if not isinstance(seed, jax.Array | np.ndarray):
         raise JaxmarkError(

@@ -13,11 +13,13 @@ from jaxmark.attacks import Attack
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.watermark import HostScheme, KeyedScheme, detect_bits, embed_bits, log_evidence
 from jaxmark.watermark.carriers import KeyedCarrier
+from jaxmark.watermark.record import Record
 from tests.samples import bumpy_sphere
 
 pytestmark = pytest.mark.core
 
 MESH, KEY, LINES = bumpy_sphere(2), jm.Key(bytes(32)), 45
+PRESENCE = Record("keyed", 0, 0.1, "", "0" * 64, content="presence")
 ATTACKS = {"noise": [0.005]}
 WEAK = {"meshes": {"a": MESH}, "attacks": ATTACKS}
 
@@ -52,6 +54,29 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.detect(MESH, original="model.ply", key=KEY), "A mesh is needed, got str"),
         (lambda: jm.compare("model.ply", MESH), "A mesh is needed, got str"),
         (lambda: jm.embed(MESH, "hello", KEY), "A message is bytes, got str"),
+        (lambda: jm.detect(MESH, original=MESH, key=KEY, bits="64"), "must be a multiple of 8 bits, got '64'"),
+        (lambda: jm.detect(MESH, key=KEY, bits=64.0), "must be a multiple of 8 bits, got 64.0"),
+        (lambda: jm.detect(MESH, key=KEY, record="r.json"), "record of a mesh is needed, got str; Record.load reads"),
+        (lambda: jm.make_marker(MESH, KEY, record={}), "The record of a mesh is needed, got dict"),
+        (lambda: jm.identify(MESH, ["a"], original=MESH, key=KEY, record={}), "The record of a mesh is needed"),
+        (
+            lambda: jm.detect(MESH, key=KEY, record=PRESENCE, scheme="field"),
+            "'field' contradicts the record",
+        ),
+        (lambda: jm.embed(MESH, b"x", KEY, scheme=("keyed", 3)), r"not \('keyed', 3\)"),
+        (lambda: jm.embed(MESH, b"x", KEY, scheme=()), r"Several marks in one mesh need .*, not \(\)"),
+        (lambda: jm.embed(MESH, b"x", KEY, budget=[]), r"in \(0, 1\), got \[\]"),
+        (lambda: jm.Budget(rms="a"), r"in \(0, 1\), got 'a'"),
+        (lambda: jm.Budget(noise="a"), "a number of at least 0, got 'a'"),
+        (lambda: jm.Budget(limits=["dame"]), r'as a mapping, such as {"dame": 0.01}, got'),
+        (lambda: jm.Budget(limits={"dame": None}), "limit of dame must be a positive number, got None"),
+        (lambda: jm.capacity(MESH, coverage="1"), r"a coverage in \(0, 1\], got '1'"),
+        (lambda: jm.fingerprint(MESH, 5, KEY), "A name is text, got 5"),
+        (lambda: jm.identify(MESH, [1], original=MESH, key=KEY), "A name is text, got 1"),
+        (lambda: jm.identify(MESH, [], original=MESH, key=KEY), "No recipient is given"),
+        (lambda: jm.identify(MESH, None, original=MESH, key=KEY), "Names are a list, got None"),
+        (lambda: jm.load_mesh(None), "A path is needed, got NoneType"),
+        (lambda: jm.attack(MESH, "noise", 0.1, seed=-1), "A seed must not be negative, got -1"),
         (
             lambda: jm.detect(MESH, original=MESH, key=KEY, message=b"abc", bits=64),
             "has 24 bits, but the payload is 64",

@@ -60,8 +60,8 @@ def align_cloud(original: Original, suspect: PreparedSuspect, align: Align, refl
         return min(fitting, key=lambda result: result.residual)
     distance = f" (at best at a distance of {100 * least:.2g} % of the diagonal)" if least < np.inf else ""
     raise AlignmentError(
-        f"The suspect could not be aligned: in no pose are its points near the original's{distance}. Move it into the"
-        " original's pose and cut off the parts that do not belong to it."
+        f"The suspect could not be aligned: in no pose are its points near the original's{distance}. If it is"
+        " of the original, move it into the original's pose and cut off the parts that do not belong to it."
     )
 
 

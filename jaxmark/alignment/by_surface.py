@@ -71,7 +71,7 @@ def align_surfaces(
             if coverage
             else "in no pose is its surface near the original's."
         )
-        + " Move it into the original's pose and cut off the parts that do not belong to it."
+        + " If it is of the original, move it into the original's pose and cut off the parts that do not belong to it."
     )
 
 

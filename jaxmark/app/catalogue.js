@@ -33,7 +33,8 @@ async function list() {
   listed += answer.originals.length;
   place("count").textContent = `${answer.count} ${answer.count === 1 ? "original" : "originals"}`;
   for (const entry of answer.originals) {
-    const counts = `${entry.vertices} vertices, ${entry.records} records, ${entry.recipients} recipients`;
+    const several = (number, name) => `${number} ${name}${number === 1 ? "" : "s"}`;
+    const counts = `${entry.vertices} vertices, ${several(entry.records, "record")}, ${several(entry.recipients, "recipient")}`;
     place("originals").append(make("figure", null, picture(entry.id), make("figcaption", `${entry.id}  ${entry.name}: ${counts}`)));
   }
   place("more").hidden = listed >= answer.count;

@@ -4,6 +4,7 @@ import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import click
@@ -15,7 +16,7 @@ from jaxmark.app.output import FileOutcome, answer, error_text, say
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
 from jaxmark.errors import JaxmarkError
-from jaxmark.files.atomic import file_hash
+from jaxmark.files.atomic import file_hash, replacing
 from jaxmark.files.pair import refuse_existing, writing_pair
 from jaxmark.files.typed import normalise
 from jaxmark.watermark.coding.keys import Key
@@ -116,7 +117,7 @@ def list_command(catalogue_file: Path, as_json: bool) -> None:
     """List the originals in a catalogue, one per line."""
     with Catalogue(catalogue_file, read_only=True) as catalogue:
         for entry in catalogue.originals():
-            counts = f"{entry.vertices} vertices, {entry.records} records, {entry.recipients} recipients"
+            counts = _counts(vertex=entry.vertices, record=entry.records, recipient=entry.recipients)
             answer(as_json, entry._asdict(), f"{entry.id}  {entry.path}  {counts}")
 
 
@@ -191,8 +192,13 @@ def import_command(file: Path, catalogue_file: Path, as_json: bool) -> None:
     """
     if not file.is_file():
         raise JaxmarkError(f"{file} is not a file; give one that `jaxmark catalogue export` wrote.")
-    with Catalogue(catalogue_file) as catalogue:
-        counts = import_catalogue(catalogue, file)
+    # A new catalogue gets its name when the import has succeeded.
+    is_new = not catalogue_file.exists()
+    with replacing(catalogue_file) if is_new else nullcontext(catalogue_file) as target:
+        with Catalogue(target) as catalogue:
+            counts = import_catalogue(catalogue, file)
+        if is_new and catalogue_file.exists():
+            raise JaxmarkError(f"Another process has made {catalogue_file} meanwhile; import again.")
     answer(as_json, counts._asdict(), f"{_counts_text(counts)}, new in {catalogue_file}")
 
 
@@ -228,8 +234,15 @@ def _existing(catalogue_file: Path) -> Catalogue:
 
 
 def _counts_text(counts: tuple[int, ...]) -> str:
-    originals, records, recipients, verdicts = counts
-    return f"{originals} originals, {records} records, {recipients} recipients, {verdicts} verdicts"
+    return _counts(**dict(zip(("original", "record", "recipient", "verdict"), counts, strict=True)))
+
+
+def _counts(**counts: int) -> str:
+    """List numbers of things by their names in the singular."""
+    plurals = {"vertex": "vertices"}
+    return ", ".join(
+        f"{count} {name if count == 1 else plurals.get(name, name + 's')}" for name, count in counts.items()
+    )
 
 
 @click.command(name="mark-for")

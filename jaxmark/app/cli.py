@@ -167,7 +167,7 @@ def embed_command(
 ) -> None:
     """Embed a message in ORIGINAL: a mesh file, or a folder of mesh files.
 
-    Needs the key and a message, --presence or --recipient.
+    Needs the key and one of --message, --text, --presence and --recipient.
 
     Writes MARKED, in the same format, and its record. Only positions change, and normals where the file has them;
     materials, colours, groups and comments stay the same, byte by byte. The record holds no secret, but that of `field`
@@ -304,16 +304,16 @@ def detect_command(
     check_alpha(alpha)
     named = schemes or ()
     blind = [name for name in named if name in BLIND_SCHEMES]
-    if len(named) == len(blind) == 1 and (original, align, report, dossier) != (None, "auto", None, None):
+    only_blind = len(named) == len(blind) == 1
+    if only_blind and original is not None and record_file is None:
+        raise JaxmarkError(f"The scheme {blind[0]!r} is read without the original; leave out --original.")
+    if original is None and named and not blind:
+        raise JaxmarkError(f"The scheme {named[0]!r} is not blind; give --original.")
+    if (only_blind or original is None) and (align, report, dossier) != ("auto", None, None):
         raise JaxmarkError(
-            f"The scheme {blind[0]!r} is read without the original; leave out --original, --align, --report and"
-            " --dossier."
+            "--align, --report and --dossier are of marks that are read with the original; blind marks have none. For"
+            " a mark of another scheme, give --original; otherwise, leave them out."
         )
-    if original is None:
-        if named and not blind:
-            raise JaxmarkError(f"The scheme {named[0]!r} is not blind; give --original.")
-        if align != "auto" or report is not None or dossier is not None:
-            raise JaxmarkError("--align, --report and --dossier are for non-blind reading; give --original.")
     reader = FileReader(
         read_key(key_file),
         0 if presence else bits,
@@ -451,7 +451,7 @@ _KINDS = "\n".join(
 )
 
 
-@cli.command(name="attack", epilog=_KINDS)
+@cli.command(name="attack", epilog=_KINDS, context_settings={"ignore_unknown_options": True})  # -1 is no option
 @click.argument("source", metavar="IN", type=FILE)
 @click.argument("target", metavar="OUT", type=FILE)
 @click.argument("words", metavar="KIND STRENGTH [KIND STRENGTH]...", nargs=-1, required=True)

@@ -64,7 +64,7 @@ def diagnose(suspect: Mesh, mark: Mark, align: Align) -> tuple[str, ...]:
     return (
         f"Without the record, only {looked_for} was looked for: if the message has another size, give that by --bits"
         " (a text has 8 bits for each byte). The original must have exactly the coordinates, and the order, in which it"
-        " was marked.",
+        " was marked. Blind marks are read without --original, and copies for recipients by `jaxmark identify`.",
     )
 
 

@@ -16,7 +16,7 @@ from jaxmark.app.progress import Doing, quietly
 from jaxmark.errors import AlignmentError, JaxmarkError, require
 from jaxmark.files import Scene, limits, load_mesh, load_scene, load_skin
 from jaxmark.files.programs import release_programs
-from jaxmark.files.typed import find_name
+from jaxmark.files.typed import find_name, rename_like
 from jaxmark.geometry.mesh import Mesh, digest
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -26,7 +26,7 @@ from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection
 from jaxmark.watermark.markers import make_marker
 from jaxmark.watermark.nonblind import Alternatives, Charges
-from jaxmark.watermark.record import Record, SceneRecord, TimestampedCommitment, load_record
+from jaxmark.watermark.record import Record, SceneRecord, TimestampedCommitment, check_scheme, load_record
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES, DEFAULT_SCHEME, USUAL_BLIND_SCHEMES
 
 
@@ -100,17 +100,20 @@ class FileReader:
                 require("matplotlib", "plot")
         if dossier is not None:
             require("jinja2", "plot")
+        check_scheme(loaded, self.schemes[0] if self.schemes else None)
+        if loaded is not None and (loaded.scheme in BLIND_SCHEMES) != (original is None):
+            what = "blind; leave out" if original is not None else "read with the original; give"
+            raise JaxmarkError(f"{record}: the mark of this record is {what} --original.")
         if original is None:
             return self._outcome(_with_caveats(self._read_blind(suspect, loaded), caveats), suspect, loaded)
-        if loaded is not None and self.schemes and self.schemes[0] != loaded.scheme:
-            raise JaxmarkError(
-                f"--scheme {self.schemes[0]} contradicts the record, whose scheme is {loaded.scheme}; leave it out."
-            )
         self.doing(f"reading {suspect} and {original}")
         if isinstance(loaded, Record):  # a record of the whole file
             name, original_mesh, marked = "", load_mesh(original), loaded.meshes
         else:
             scene = load_scene(original)
+            if loaded is not None:
+                named = partial(rename_like, names=loaded.meshes)
+                scene = Scene(named(scene.meshes), named(scene.skipped))
             name, *others = self._names(scene, original, loaded)
             if others:
                 if report is not None or dossier is not None:
@@ -179,9 +182,6 @@ class FileReader:
         """
         # Equal meshes and equal records give equal readings: they are read, and charged, once.
         records = [None] if record is None else list({each.digest(): each for each in record.meshes.values()}.values())
-        for entry in records:
-            if entry is not None and entry.scheme not in BLIND_SCHEMES:
-                raise JaxmarkError(f"The scheme {entry.scheme!r} of the record is not blind; give --original.")
         self.doing(f"reading {suspect}")
         scene = load_scene(suspect)
         selected = pick(scene, self.meshes, suspect).meshes
@@ -235,6 +235,9 @@ class FileReader:
                 names = ", ".join(map(repr, marked))
                 raise JaxmarkError(f"The record has no mesh {name!r}, which --mesh selects; it has {names}.")
         names = list(dict.fromkeys(self.meshes or marked))
+        for name in names:
+            if record is not None and not find_name(name, known):
+                raise JaxmarkError(f"{original} lacks the mesh {name!r} of the record; give the file that was marked.")
         return list(pick(scene, names, original).meshes)
 
     def _read_scene(self, suspect: Path, original: Scene, record: SceneRecord | None) -> Detection:
@@ -257,8 +260,8 @@ class FileReader:
         parts = [part._replace(evidence=part.evidence.charged(charge)) for part in detection.parts.values()]
         detection = self._count_proving(detection, parts, count)
         equal = list(detection.skipped.values()).count(EQUALS_ANOTHER)
-        note = f"{equal} {'equals another' if equal == 1 else 'equal others'}, and count{'s' * (equal == 1)} once."
-        return detection._replace(notes=(*detection.notes, note)) if equal else detection
+        said = "mesh equals another, and adds" if equal == 1 else "meshes equal others, and add"
+        return detection._replace(notes=(*detection.notes, f"{equal} {said} no evidence.")) if equal else detection
 
     def _count_proving(self, detection: Detection, parts: Sequence[Detection], meshes: int) -> Detection:
         """Add a note on how many of several meshes prove the mark without the others, after the charge for each."""
@@ -288,13 +291,13 @@ def _other_reading(record: Record | SceneRecord | None, schemes: Sequence[BlindS
     """Say which reading may find a mark where a blind one of a record, or of some schemes, found none; "" if none."""
     if record is not None:
         return "Only the mark of the record was looked for; without the record, other blind marks of the key are, too."
-    hinted = [scheme.name for scheme in schemes or USUAL_BLIND_SCHEMES if "hint" in scheme.remembered]
-    if not hinted:
-        return ""
-    return (
-        "If the suspect is a part, or has more than the marked mesh, give the record: marks of"
-        f" {' and '.join(map(repr, hinted))} are then read only with its hint."
-    )
+    said = "" if schemes else f"Marks of {DEFAULT_SCHEME!r}, the default scheme, are read only with --original. "
+    if hinted := [scheme.name for scheme in schemes or USUAL_BLIND_SCHEMES if "hint" in scheme.remembered]:
+        said += (
+            "If the suspect is a part, or has more than the marked mesh, give the record: marks of"
+            f" {' and '.join(map(repr, hinted))} are then read only with its hint."
+        )
+    return said.rstrip()
 
 
 def _distinct(names: Sequence[str], meshes: Mapping[str, Mesh]) -> list[str]:

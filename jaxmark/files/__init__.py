@@ -246,6 +246,8 @@ def _places(source: Source) -> dict[str, Indices]:
 
 def _suffix(path: str | os.PathLike) -> str:
     """Return the suffix of a path, which names a known format."""
+    if not isinstance(path, str | os.PathLike):
+        raise JaxmarkError(f"A path is needed, got {type(path).__name__}.")
     suffix = Path(path).suffix.lower()
     if suffix not in _FORMATS:
         known = ", ".join(known[1:].upper() for known in _FORMATS)

@@ -234,7 +234,8 @@ def replacing(target: Path, may_stay: MayStay = holds) -> Iterator[Path]:
         may_stay: see `write_together`.
 
     Raises:
-        JaxmarkError: if the file's folder does not exist, or the target exists and is no ordinary file.
+        JaxmarkError: if the file's folder does not exist, the target exists and is no ordinary file, or the system
+            refuses to write.
     """
     if not target.parent.is_dir():
         raise JaxmarkError(f"The folder {target.parent} does not exist.")
@@ -244,7 +245,9 @@ def replacing(target: Path, may_stay: MayStay = holds) -> Iterator[Path]:
         raise JaxmarkError(f"Cannot write {target}: it is not an ordinary file.")
     real = Path(os.path.realpath(target))
     _clear_drafts(real.parent)
-    with tempfile.TemporaryDirectory(prefix=_own_prefix(), dir=real.parent) as folder:
+    with _writing(target):
+        drafts = tempfile.TemporaryDirectory(prefix=_own_prefix(), dir=real.parent)
+    with drafts as folder:
         draft = Path(folder) / target.name
         try:
             yield draft
@@ -256,6 +259,9 @@ def replacing(target: Path, may_stay: MayStay = holds) -> Iterator[Path]:
             if file.is_file() and file != draft
         }
         if others:
-            write_together(real, draft.read_bytes(), others, may_stay)
-        else:
+            return write_together(real, draft.read_bytes(), others, may_stay)
+        with _writing(target):
+            # Otherwise, a power failure might leave the name with an empty file.
+            with draft.open("r+b") as file:
+                os.fsync(file.fileno())
             draft.replace(real)

@@ -3,10 +3,12 @@
 import re
 import tomllib
 import unicodedata
-from collections.abc import Collection, Iterable
-from typing import Any
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any, TypeVar
 
 from jaxmark.errors import JaxmarkError
+
+Item = TypeVar("Item")
 
 # The characters that Unicode calls default ignorable, which no program shows, without the two joiners.
 _INVISIBLE = re.compile(
@@ -48,8 +50,10 @@ def normalise(text: str) -> str:
     """Compose accents (Unicode's form NFC), take all spaces for one kind, and remove what is invisible or at the ends.
 
     Raises:
-        JaxmarkError: if the text has half of a surrogate pair, as from bytes that are not UTF-8.
+        JaxmarkError: if it is no text, or has half of a surrogate pair, as from bytes that are not UTF-8.
     """
+    if not isinstance(text, str):
+        raise JaxmarkError(f"A name is text, got {text!r}.")
     if any("\ud800" <= character <= "\udfff" for character in text):
         raise JaxmarkError(f"{text!a} is not text in UTF-8; type it again.")
     return _normalised(text)
@@ -59,10 +63,12 @@ def normalise_names(names: Iterable[str]) -> list[str]:
     """Normalise names, and drop repeated ones.
 
     Raises:
-        JaxmarkError: if different names become the same, or they are one text; see also `normalise`.
+        JaxmarkError: if different names become the same, or they are one text or no list; see also `normalise`.
     """
     if isinstance(names, str):
         raise JaxmarkError(f"Names are a list, not one text: give [{names!a}].")
+    if not isinstance(names, Iterable):
+        raise JaxmarkError(f"Names are a list, got {names!r}.")
     normalised: dict[str, str] = {}
     for name in names:
         first = normalised.setdefault(normalise(name), name)
@@ -86,6 +92,19 @@ def find_name(name: str, names: Collection[str]) -> str | None:
     if len(alike) > 1:
         raise JaxmarkError(f"{name!a} could be any of {', '.join(map(ascii, alike))}, which look the same.")
     return alike[0] if alike else None
+
+
+def rename_like(items: Mapping[str, Item], names: Collection[str]) -> dict[str, Item]:
+    """Give items the names that look the same as theirs, unless another item has that name.
+
+    Raises:
+        JaxmarkError: see `find_name`.
+    """
+    renamed: dict[str, Item] = {}
+    for name, item in items.items():
+        known = find_name(name, names)
+        renamed[name if known is None or known in items or known in renamed else known] = item
+    return renamed
 
 
 def _normalised(text: str) -> str:

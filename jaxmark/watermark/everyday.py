@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import NamedTuple
+from typing import NamedTuple, SupportsFloat
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from jaxmark.alignment.original import make_original
 from jaxmark.alignment.pairing import pair
 from jaxmark.alignment.result import Align, Alignment
 from jaxmark.errors import AlignmentError, JaxmarkError
-from jaxmark.files.typed import find_name
+from jaxmark.files.typed import find_name, rename_like
 from jaxmark.geometry.mesh import Mesh, check_mesh, digest
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
@@ -35,7 +35,7 @@ from jaxmark.watermark.markers import Marker, NonBlindMarker, make_blind_marker,
 from jaxmark.watermark.nonblind import Alternatives, check_claim, claims_of, read
 from jaxmark.watermark.perception.budget import Budget, BudgetLike
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Capacity, Conditions
-from jaxmark.watermark.record import Record, SceneRecord, is_recorded
+from jaxmark.watermark.record import Record, SceneRecord, check_record, check_scheme, is_recorded
 from jaxmark.watermark.schemes.passband import ADAPTIVE, candidates
 from jaxmark.watermark.schemes.registry import (
     BLIND_SCHEMES,
@@ -45,6 +45,7 @@ from jaxmark.watermark.schemes.registry import (
     find_blind,
     get_nonblind,
     make_blind_scheme,
+    name_of,
     split,
 )
 
@@ -116,8 +117,8 @@ def capacity(
     Raises:
         JaxmarkError: if the mesh is unusable or a number is out of range.
     """
-    if not 0 < coverage <= 1:
-        raise JaxmarkError(f"capacity needs a coverage in (0, 1], got {coverage:g}.")
+    if not (isinstance(coverage, SupportsFloat) and 0 < coverage <= 1):
+        raise JaxmarkError(f"capacity needs a coverage in (0, 1], got {coverage!r}.")
     budget = Budget.of(budget)
     noise = NOISE if budget.noise is None else budget.noise
     if (blind := find_blind(scheme)) is not None:
@@ -162,7 +163,7 @@ def detect(
             64. With 0, presence is claimed.
         message: the message that is claimed to be in the suspect; None to read without a claim.
         record: the record of the mark, see `make_marker`.
-        scheme: the scheme that the mark was embedded with, if there is no record; by default `"keyed"` with an
+        scheme: the scheme that the mark was embedded with, which a record also says; by default `"keyed"` with an
             original, and `"field"` or `"local"` without it. Several names stand for marks that were embedded together,
             whose evidence is united.
         detector: a detector, see `make_marker`.
@@ -174,14 +175,16 @@ def detect(
         The result of the reading; a suspect identical to the original gives `log10_p` = 0.
 
     Raises:
-        JaxmarkError: see `make_marker`; also if the suspect cannot be aligned, or the claimed message has another size
-            than the payload, or is not the one that the record commits to.
+        JaxmarkError: see `make_marker`; also if the suspect cannot be aligned, the claimed message has another size
+            than the payload, or message or scheme are not those of the record.
     """
     if bits is None and record is None and isinstance(message, bytes):
         bits = 8 * len(message)
     together: tuple[BlindScheme, ...] = ()
     if isinstance(scheme, tuple):
         scheme, together = split(scheme)
+    check_record(record)
+    check_scheme(record, None if scheme is None else name_of(scheme))
     named = scheme if record is None else record.scheme
     blind = None if named is None else find_blind(named)
     if blind is not None or (named is None and original is None):
@@ -388,6 +391,7 @@ def detect_scene(
     marked, caveats = originals, ()
     if record is not None:
         marked, caveats = record.meshes, record.caveats(key)
+        originals = rename_like(originals, marked)
     names = [find_name(name, originals) or name for name in names]
     # The order of a file's meshes decides which of equal meshes counts; a record's digest does not cover it.
     chosen = sorted(name for name in marked if name in names or not names)

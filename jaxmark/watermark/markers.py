@@ -27,7 +27,7 @@ from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.blind.writing import Writer, remedies
 from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
-from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size
+from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_payload, check_size
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence
 from jaxmark.watermark.evidence.ledger import Charge, rounded_up
@@ -36,7 +36,7 @@ from jaxmark.watermark.mark import EmbedInfo, Mark, recall
 from jaxmark.watermark.nonblind import Alternatives, read
 from jaxmark.watermark.perception.budget import Bounds, Budget, BudgetLike, reference_of
 from jaxmark.watermark.perception.capacity import COVERAGE, NOISE, Conditions, Survival
-from jaxmark.watermark.record import Record, commit, is_recorded
+from jaxmark.watermark.record import Record, check_record, commit, is_recorded
 from jaxmark.watermark.schemes.passband import choose_pass_band
 from jaxmark.watermark.schemes.registry import (
     BLIND_SCHEMES,
@@ -536,6 +536,9 @@ def make_marker(
             or payload.
     """
     key = Key(key)
+    check_record(record)
+    if bits is not None:
+        check_payload(bits)
     if record is not None:
         bits = record.payload(key, bits)
         if isinstance(scheme, str):

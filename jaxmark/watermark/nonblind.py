@@ -41,6 +41,10 @@ from jaxmark.watermark.record import is_recorded
 
 Charges = tuple[Charge, ...]
 
+_SAME = (
+    "Suspect and original have the same shape, so that there is nothing to read. Is the original the marked mesh? Then"
+    " give the unmarked one."
+)
 _WORSE = 3.0  # ratio of residuals from which on the worse reflection is not read
 
 
@@ -144,7 +148,7 @@ def read(
     # Rounding moves no coordinate by more than half of the grid spacing, and the fit of the pose by little more. A mark
     # that can be read moves some coordinates by more.
     if np.abs(aligned.displacement).max() * mark.original.diagonal <= 0.75 * mark.original.grid:
-        return empty._replace(notes=("The suspect is the original itself, without a mark.",))
+        return empty._replace(notes=(_SAME,))
     charges = (*charges, *mark.order_charges, ledger.ALIGNMENT.charge(aligned.align))
     reading = _Reading(mark, aligned, empty, claimed)
     second_reading = reading.alternative(received) if weights is None else None

@@ -159,7 +159,7 @@ class Record:
         """
         self.check("message" if self.bits else "presence", key)
         if bits not in (None, self.bits):
-            raise JaxmarkError(f"The payload is {self.bits} bits according to the record, not {bits}.")
+            raise JaxmarkError(f"The record is of {_payload(self.bits)}, not of {_payload(bits)}.")
         return self.bits
 
     def commits_to(self, content: bytes, choices: Choices) -> bool:
@@ -255,7 +255,11 @@ class Record:
 
 @dataclass(frozen=True)
 class SceneRecord:
-    """The records of a file's meshes, by name; each of them can also be used to read its mesh alone."""
+    """The records of a file's meshes, by name.
+
+    Each of them can also be used to read its mesh alone, if it was fixed before the suspect existed which mesh that is.
+    Otherwise the choice must be charged: give `detect_scene` this record and the mesh by `names`.
+    """
 
     meshes: Mapping[str, Record]
     code: str = ""  # the owner's authentication code of the names and their records; empty if there is none
@@ -328,6 +332,28 @@ class SceneRecord:
         return Choices(Key(key), b"").derive("scene", KEY_BYTES, self._digests()).hex()
 
 
+def check_record(record: Record | None) -> None:
+    """Refuse anything but the record of one mesh, or None.
+
+    Raises:
+        JaxmarkError: if it is something else, such as a path.
+    """
+    if not isinstance(record, Record | None):
+        raise JaxmarkError(f"The record of a mesh is needed, got {type(record).__name__}; Record.load reads one.")
+
+
+def check_scheme(record: Record | SceneRecord | None, named: str | None) -> None:
+    """Check that a scheme that was named, if any, is that of the record.
+
+    Raises:
+        JaxmarkError: if it is another one.
+    """
+    if record is not None and named not in (None, record.scheme):
+        raise JaxmarkError(
+            f"The scheme {named!r} contradicts the record, whose scheme is {record.scheme!r}; leave it out."
+        )
+
+
 def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
     """Read a record file of one mesh or of several.
 
@@ -351,6 +377,10 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
         return SceneRecord(records, code)
     except JaxmarkError as error:
         raise JaxmarkError(f"{path}: {error}") from None
+
+
+def _payload(bits: int | None) -> str:
+    return f"a payload of {bits!r} bits" if bits else "a presence mark"
 
 
 def read_json(path: str | os.PathLike[str]) -> Any:

@@ -189,7 +189,7 @@ def test_mistakes_are_said(workshop: Workshop):
     assert code == 1
     assert "A message of 16 bits is readable with the scheme 'keyed'" in said
     itself = workshop.json("detect", "millimetres.stl", *DETECT, "--bits", "16", status=1)
-    assert itself["notes"] == ["The suspect is the original itself, without a mark."]
+    assert "same shape" in itself["notes"][0]
 
 
 def test_how_copies_are_aligned_is_paid_for(workshop: Workshop):

@@ -7,7 +7,7 @@ import pytest
 
 from jaxmark.errors import JaxmarkError
 from jaxmark.files import atomic
-from jaxmark.files.atomic import write_atomically
+from jaxmark.files.atomic import replacing, write_atomically
 
 pytestmark = pytest.mark.core
 
@@ -68,6 +68,23 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
     write_atomically(tmp_path / "link", b"after")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real").read_bytes() == b"after"
+
+
+def test_folders_that_cannot_be_written_are_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(atomic.tempfile, "mkdtemp", refuse)
+    with pytest.raises(JaxmarkError, match=r"Cannot write .*file: Permission denied"), replacing(tmp_path / "file"):
+        pytest.fail("There is no draft.")
+
+
+def test_what_gets_its_name_has_reached_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    synced: list[int] = []
+    monkeypatch.setattr(os, "fsync", lambda descriptor: synced.append(os.fstat(descriptor).st_ino))
+    with replacing(tmp_path / "file") as draft:
+        draft.write_bytes(b"content")
+    assert synced == [(tmp_path / "file").stat().st_ino]
 
 
 @pytest.mark.skipif(os.name != "posix", reason="only there can a process be asked whether it runs")

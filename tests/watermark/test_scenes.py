@@ -270,6 +270,35 @@ def test_records_of_files(marked, tmp_path: Path):
             load_record(tmp_path / "b.json")
 
 
+def test_names_that_look_like_those_of_the_record_are_its_meshes(marked, key: jm.Key, tmp_path: Path):
+    """Programs compose accents in different ways when they save a file."""
+    shapes = [bumpy_sphere(3, 7), bumpy_sphere(3, 8)]
+    written, info = embed_scene(dict(zip(("\u00e9", "other"), shapes, strict=True)), MESSAGE, key, budget=BUDGET)
+    decomposed = dict(zip(("e\u0301", "other"), shapes, strict=True))
+    found = detect_scene(written, originals=decomposed, key=key, record=info.record)
+    assert (found.message, sorted(found.parts)) == (MESSAGE, ["other", "\u00e9"])
+    (tmp_path / "original.obj").write_text(_obj(decomposed))
+    (tmp_path / "marked.obj").write_text(_obj(written))
+    (tmp_path / "record.json").write_text(info.record.to_json())
+    files = (tmp_path / "marked.obj", tmp_path / "original.obj", tmp_path / "record.json")
+    for meshes in ((), ("e\u0301",), ("\u00e9",)):
+        assert FileReader(key, None, None, meshes=meshes).read(*files).values["message"] == MESSAGE.hex()
+    other = SceneRecord({"absent": info.record.meshes["\u00e9"], **info.record.meshes}).to_json()
+    (tmp_path / "record.json").write_text(other)
+    with pytest.raises(jm.JaxmarkError, match="lacks the mesh 'absent' of the record"):
+        FileReader(key, None, None).read(*files)
+
+
+def _obj(meshes: dict[str, Mesh]) -> str:
+    """The text of an OBJ file with these objects."""
+    lines, first = [], 1
+    for name, mesh in meshes.items():
+        lines += [f"o {name}", *("v {!r} {!r} {!r}".format(*row) for row in np.asarray(mesh.vertices).tolist())]
+        lines += ["f {} {} {}".format(*row) for row in np.asarray(mesh.faces) + first]
+        first += len(mesh.vertices)
+    return "\n".join(lines)
+
+
 def test_pairs(originals):
     turned = {name: moved(mesh, TURN) for name, mesh in originals.items()}
     # By connectivity, whatever the names say.

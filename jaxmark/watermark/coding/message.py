@@ -4,6 +4,7 @@ The message and its tag are encoded together as one polar codeword (`jaxmark.wat
 the most plausible candidates. The tag, which uses a subkey of its own, decides which candidate is the message, if any.
 """
 
+from numbers import Integral
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +19,16 @@ TAG_BITS = 28
 CANDIDATES = 64  # number of candidate messages whose tags the decoder compares
 
 
+def check_payload(bits: int) -> None:
+    """Check the size of a payload.
+
+    Raises:
+        JaxmarkError: if it is no whole number of bits, negative, or no multiple of 8.
+    """
+    if not isinstance(bits, Integral) or bits < 0 or bits % 8:
+        raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits!r}.")
+
+
 def code_length(bits: int, places: int, spread: int) -> int:
     """Choose the number of code bits for a payload: the largest useful power of two that the carrier can hold.
 
@@ -29,10 +40,9 @@ def code_length(bits: int, places: int, spread: int) -> int:
     Raises:
         JaxmarkError: if the payload is negative or no multiple of 8, or too large for the carrier.
     """
+    check_payload(bits)
     if bits == 0:
         return 1
-    if bits < 0 or bits % 8:
-        raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits}.")
     information = bits + TAG_BITS
     length = 1 << (max(1, min(places, spread * information)).bit_length() - 1)
     if information > length:

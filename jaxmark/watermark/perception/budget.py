@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, SupportsFloat
 
 import numpy as np
 from jaxtyping import Float64
@@ -101,18 +101,24 @@ class Budget:
         Raises:
             JaxmarkError: if there is no such metric or visibility, or a number is out of range.
         """
-        if self.rms is not None and not 0 < self.rms < 1:
-            raise JaxmarkError(f"The budget is relative to the bounding box's diagonal and in (0, 1), got {self.rms}.")
-        if self.noise is not None and not 0 <= self.noise < math.inf:
-            raise JaxmarkError(f"The noise to survive is a number of at least 0, got {self.noise}.")
+        if self.rms is not None and not (_is_number(self.rms) and 0 < self.rms < 1):
+            raise JaxmarkError(
+                f"The budget is relative to the bounding box's diagonal and in (0, 1), got {self.rms!r}."
+            )
+        if self.noise is not None and not (_is_number(self.noise) and 0 <= self.noise < math.inf):
+            raise JaxmarkError(f"The noise to survive is a number of at least 0, got {self.noise!r}.")
+        if self.limits is not None and not isinstance(self.limits, Mapping):
+            raise JaxmarkError(
+                f'Limits have names: give them as a mapping, such as {{"dame": 0.01}}, got {self.limits!r}.'
+            )
         if self.visibility not in (None, *VISIBILITY):
             raise JaxmarkError(f"visibility is one of {', '.join(map(repr, VISIBILITY))}, not {self.visibility!r}.")
         for metric, limit in (self.limits or {}).items():
             if isinstance(metric, str) and metric not in distortion.METRICS:
                 known = ", ".join(distortion.METRICS)
                 raise JaxmarkError(f"There is no metric {metric!r} to limit; the metrics are {known}.")
-            if not 0 < limit < math.inf:
-                raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {limit}.")
+            if not (_is_number(limit) and 0 < limit < math.inf):
+                raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {limit!r}.")
         if self.rms is None and self.visibility is None and self.limits is not None and not self.limits:
             raise JaxmarkError("A mark needs a budget or at least one limit.")
 
@@ -156,6 +162,11 @@ class Budget:
         parts += [f"{name_of(metric)}={limit}" for metric, limit in (self.limits or {}).items()]
         parts += [] if self.noise is None else [f"noise={self.noise}"]
         return " ".join(parts) or "hidden"
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number, also one of NumPy or JAX, and no text."""
+    return isinstance(value, SupportsFloat)
 
 
 #: A budget, or a short form of one: see `Budget`.

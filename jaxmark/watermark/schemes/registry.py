@@ -166,14 +166,16 @@ def split(scheme: AnyScheme) -> tuple[str | Scheme | None, tuple[BlindScheme, ..
         if (blind := find_blind(scheme)) is not None:
             return None, (blind,)
         return scheme if isinstance(scheme, str) else get_nonblind(scheme), ()
-    if len(scheme) < 2 or scheme[0] not in SCHEMES or any(name not in BLIND_SCHEMES for name in scheme[1:]):
+    first, *others = scheme or ("",)
+    known = all(isinstance(name, str) for name in scheme) and first in SCHEMES and set(others) <= BLIND_SCHEMES.keys()
+    if not others or not known:
         raise JaxmarkError(
             f"Several marks in one mesh need one scheme that is read with the original ({', '.join(SCHEMES)}), followed"
-            f" by blind schemes ({', '.join(BLIND_SCHEMES)}), not {', '.join(scheme)}."
+            f" by blind schemes ({', '.join(BLIND_SCHEMES)}), not {scheme!r}."
         )
     if len(set(scheme)) < len(scheme):
         raise JaxmarkError(f"Each scheme can mark a mesh once, but one is named twice: {', '.join(scheme)}.")
-    return scheme[0], tuple(BLIND_SCHEMES[name] for name in scheme[1:])
+    return first, tuple(BLIND_SCHEMES[name] for name in others)
 
 
 def name_of(scheme: AnyScheme) -> str:

@@ -17,7 +17,7 @@ from jaxmark.watermark.coding.keys import Key
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.mark import EmbedInfo, Mark, bind_mark, recall
 from jaxmark.watermark.perception.budget import BudgetLike
-from jaxmark.watermark.record import Record
+from jaxmark.watermark.record import Record, check_record
 from jaxmark.watermark.schemes.keyed import KeyedScheme
 from jaxmark.watermark.schemes.registry import get_nonblind, make_scheme
 from jaxmark.watermark.tracing.tardos import Accusation, biases, codewords, rank
@@ -63,11 +63,12 @@ class Tracer:
         self, suspect: Mesh, recipients: Iterable[str], top: int = 10, align: Align = "auto"
     ) -> list[Accusation]:
         """Rank recipients by their scores in a suspect; see `identify`."""
-        return self.read(self.register(suspect, align), recipients, top)
+        names = _names(recipients)  # before the suspect is aligned, which takes long
+        return self.rank(self.register(suspect, align), names, top)
 
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients by their scores in an aligned suspect; see `identify`."""
-        return self.rank(aligned, normalise_names(recipients), top)
+        return self.rank(aligned, _names(recipients), top)
 
     def rank(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients as `read` does, by identifiers that a catalogue holds and that are not normalised again."""
@@ -91,6 +92,7 @@ def make_tracer(original: Mesh, key: bytes, *, record: Record | None = None) -> 
             another original or key.
     """
     key, scheme = Key(key), KeyedScheme()
+    check_record(record)
     if record is not None:
         record.check("fingerprint", key)
         scheme = get_nonblind(make_scheme(record.scheme, record.parameters))
@@ -153,7 +155,16 @@ def identify(
         codewords alone (see `jaxmark.watermark.tracing.tardos`).
 
     Raises:
-        JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, an identifier is empty, or two
-            identifiers differ only in what cannot be seen.
+        JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, there is no recipient, an identifier is
+            empty, or two identifiers differ only in what cannot be seen.
     """
-    return make_tracer(original, key, record=record).identify(suspect, recipients, top, align)
+    names = _names(recipients)  # before the original is prepared
+    return make_tracer(original, key, record=record).identify(suspect, names, top, align)
+
+
+def _names(recipients: Iterable[str]) -> list[str]:
+    """Normalise the identifiers of recipients; refused if there are none."""
+    names = normalise_names(recipients)
+    if not names:
+        raise JaxmarkError("No recipient is given; give the identifiers of all recipients of a copy.")
+    return names
