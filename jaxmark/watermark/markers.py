@@ -406,8 +406,8 @@ class CombinedMarker:
     """A `Marker` of several marks in one mesh within one budget: one non-blind mark, and blind ones.
 
     The budget is shared so that all marks survive the same noise, as predicted from the noise that each mark survives
-    if it uses the whole budget. The marks are written one after another, the blind ones last. The last mark gets the
-    part of the budget that the others left.
+    if it uses the whole budget. The marks are written one after another, the blind ones last, and of these the one with
+    `BlindScheme.written_last`. The last mark gets the part of the budget that the others left.
     """
 
     nonblind: NonBlindMarker
@@ -428,7 +428,8 @@ class CombinedMarker:
         reference = reference_of(self.original)
         _, alone = self.nonblind.embed(message, Budget(rms=bounds.rms, limits=bounds.limits), read_back="never")
         sizes, survived = [alone.rms], [alone.survives.whole]
-        for marker in self._blind:
+        blind = sorted(self._blind, key=lambda marker: marker.scheme.written_last)
+        for marker in blind:
             plan = marker.writer.plan(
                 blind_reading.codeword(message, marker.writer.choices), bounds, reference, marker.bits
             )
@@ -439,8 +440,8 @@ class CombinedMarker:
         marked, info = self.nonblind.embed(message, first, read_back="never")
         survives, notes = [info.survives], [*alone.notes]
         limits = {**bounds.limits, **({} if bounds.rms is None else {"rms": bounds.rms})}
-        for place, scheme in enumerate(self.schemes, 1):
-            rms = None if place == len(self.schemes) else shares[place] * sizes[place]
+        for place, scheme in enumerate((marker.scheme for marker in blind), 1):
+            rms = None if place == len(blind) else shares[place] * sizes[place]
             marker = self._make_blind(make_original(marked), scheme)
             marked, blind_info = marker.write(
                 message, Budget(rms=rms, noise=budget.noise, limits=limits), reference, to_be_read=read_back != "never"

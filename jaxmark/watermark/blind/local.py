@@ -50,6 +50,7 @@ class LocalScheme(BlindScheme):
 
     name: ClassVar[str] = "local"
     in_parts: ClassVar[bool] = True
+    written_last: ClassVar[bool] = True
     widths: tuple[float, ...] = (32.0,)  # power k of the narrow average (I - Δ/2)^k
     steps: tuple[float, ...] = tuple(0.0625 * 2 ** (rung / 2) for rung in range(11))  # quantisation steps
     hiding: bool = False  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`

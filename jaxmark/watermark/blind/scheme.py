@@ -94,6 +94,8 @@ class BlindScheme(Protocol):
     in_parts: ClassVar[bool]  # whether a part of the shape can be read alone
     #: Whether a reader finds the anchors by the key: it takes long, and finds none in an unmarked mesh.
     by_key: ClassVar[bool] = False
+    #: Whether it is written after other schemes: their displacements change its values more than its own change theirs.
+    written_last: ClassVar[bool] = False
     least_alpha: ClassVar[float] = 0.6  # least fraction α of the way to the lattice that values are moved
     remembered: ClassVar[tuple[str, ...]] = ()  # names of the texts that `recorded` may return
     __dataclass_fields__: ClassVar[dict[str, Any]]

@@ -12,13 +12,13 @@ import jaxmark as jm
 from jaxmark.alignment.original import make_original
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.spectral.graphs import from_mesh
-from jaxmark.watermark import EmbedInfo, LocalScheme
+from jaxmark.watermark import EmbedInfo, FieldScheme, LocalScheme
 from jaxmark.watermark.blind import local, reading
 from jaxmark.watermark.blind.reading import context
 from jaxmark.watermark.blind.scheme import measure
 from jaxmark.watermark.blind.writing import Writer
 from jaxmark.watermark.evidence import ledger
-from jaxmark.watermark.markers import make_blind_marker, prepare, unite
+from jaxmark.watermark.markers import CombinedMarker, make_blind_marker, prepare, unite
 from jaxmark.watermark.perception.capacity import Survival
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 from tests.app.test_cli import MESSAGE as CLI_MESSAGE
@@ -178,6 +178,17 @@ def test_several_marks_are_read_each_alone_and_united(key: jm.Key):
     assert both.log10_p == pytest.approx(max(-77, (math.log1p(nats) - nats) / math.log(10)))
     assert jm.detect(marked, key=key, bits=8, scheme="local").message == MESSAGE
     assert jm.detect(marked, key=key, original=mesh, record=info.record).message == MESSAGE
+
+
+@pytest.mark.slow
+def test_the_order_of_blind_schemes_does_not_matter(key: jm.Key):
+    """`local` is written last: it would not be read after `field` had moved the surface."""
+    nonblind = jm.make_marker(rough_sphere(4000), key, bits=8)
+    schemes = (LocalScheme(), FieldScheme(with_hint=False).fixed(0.025, 0.0008))
+    markers = [CombinedMarker(nonblind, order) for order in (schemes, schemes[::-1])]
+    one, other = (marker.embed(MESSAGE, 3e-3, read_back="never")[0] for marker in markers)
+    np.testing.assert_array_equal(one.vertices, other.vertices)
+    assert jm.detect(one, key=key, bits=8, scheme="local").message == MESSAGE
 
 
 def test_united_probabilities_hold():
