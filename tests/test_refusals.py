@@ -44,7 +44,7 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.Study(**WEAK, budgets=8e-4), "The budgets of a study are a list, .* got 0.0008"),
         (lambda: jm.Study(**WEAK, samples=[0, 1]), r"samples is a whole number, such as 5, got \[0, 1\]"),
         (lambda: jm.robustness(None, MESH, b"", mine), "name of ATTACKS or an Attack, .* got 'mine'"),
-        (lambda: jm.attack(MESH, "noise", "much", seed=0), "strength of an attack must be a number, .* got 'much'"),
+        (lambda: jm.attack(MESH, "noise", "much", seed=0), "strength of an attack must be a number .* got 'much'"),
         (
             lambda: jm.attack(MESH, "noise", 0.1, seed=None),
             "seed must be a whole number, .* or a random key of JAX, got None",

@@ -1,6 +1,5 @@
 """The commands of `jaxmark catalogue`, and `jaxmark mark-for`, which marks a copy for a recipient."""
 
-import os
 import re
 import sys
 from collections.abc import Iterator, Sequence
@@ -12,7 +11,7 @@ import click
 from jaxmark.app.folders import mesh_files
 from jaxmark.app.mark_files import mark_file
 from jaxmark.app.options import FILE, JSON, KEY, OVERWRITE, QUIET, budget_options, read_key
-from jaxmark.app.output import FileOutcome, answer, error_text, say
+from jaxmark.app.output import FileOutcome, answer, check_distinct, error_text, say
 from jaxmark.app.progress import current
 from jaxmark.catalogue import Catalogue, export_catalogue, import_catalogue
 from jaxmark.errors import JaxmarkError
@@ -280,13 +279,17 @@ def mark_for_command(
         if not _PLAIN.fullmatch(recipient):
             raise JaxmarkError(f"{recipient!r} cannot be part of a file's name; name the copy by --output.")
         output = Path(f"{original.stem}-{recipient}{original.suffix}")
-    if os.path.realpath(output) in map(os.path.realpath, (original, key_file, catalogue_file)):
-        raise JaxmarkError(f"{output} is the original, the key or the catalogue; name the copy by --output.")
+    record = _record_of(output)
+    check_distinct(original=original, key=key_file, catalogue=catalogue_file, output=output, record=record)
     key = read_key(key_file)
     current().doing(f"marking {original} for {recipient}")
     with Catalogue(catalogue_file) as catalogue:
         outcome = mark_copy(catalogue, recipient, original, output, key, budget, overwrite=overwrite)
     answer(as_json, {"recipient": recipient, **outcome.values}, *outcome.lines)
+
+
+def _record_of(copy: Path) -> Path:
+    return copy.with_name(copy.name + RECORD_SUFFIX)
 
 
 def mark_copy(
@@ -313,7 +316,7 @@ def mark_copy(
     Raises:
         JaxmarkError: see `mark_file`.
     """
-    record = copy.with_name(copy.name + RECORD_SUFFIX)
+    record = _record_of(copy)
     with writing_pair(copy, record, overwrite=overwrite) as pair:
         outcome = mark_file(original, pair.file, pair.record, key=key, recipient=recipient, budget=budget)
         catalogue.add(original)

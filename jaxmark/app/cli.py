@@ -434,9 +434,9 @@ def commit_command(records: tuple[Path, ...], output: Path, overwrite: bool, as_
     `jaxmark detect --commitment OUTPUT` then prints the bound on the false-positive probability that holds if the
     commitment is older than the suspect. It charges log10 of the number of records.
     """
-    check_distinct(output=output, **{f"record {place}": path for place, path in enumerate(records)})
-    made = make_commitment(load_record(path).digest() for path in records)
     request = output.with_name(output.name + ".tsq")
+    check_distinct(output=output, request=request, **{f"record {place}": path for place, path in enumerate(records)})
+    made = make_commitment(load_record(path).digest() for path in records)
     with writing_pair(request, output, overwrite=overwrite) as pair:
         write_atomically(pair.file, made.timestamp_request())
         write_atomically(pair.record, made.to_json().encode())

@@ -40,6 +40,7 @@ from jaxmark.seeds import Seed, generator, random_key
 
 # The ends of the units of strengths that are lengths, relative to the vertices' mean distance to their centre or to the
 # diagonal.
+_MOST_STRENGTH = 1e30  # far beyond any use, and far within the range of float32
 _OVER_RADIUS, _OVER_DIAGONAL = "over the mean distance to the centre", "over the diagonal"
 
 
@@ -236,8 +237,10 @@ class Registry(NamedTuple):
 
 
 def _check_strength(strength: float) -> None:
-    if not (isinstance(strength, Real) and np.isfinite(strength) and strength >= 0):
-        raise JaxmarkError(f"The strength of an attack must be a number, not negative, got {strength!r}.")
+    if not (isinstance(strength, Real) and 0 <= strength <= _MOST_STRENGTH):
+        raise JaxmarkError(
+            f"The strength of an attack must be a number from 0 to {_MOST_STRENGTH:g}, got {strength!r}."
+        )
 
 
 def _apply(mesh: Mesh, entry: Attack, strength: float, seed: PRNGKeyArray) -> Mesh:

@@ -301,7 +301,11 @@ class Catalogue:
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / f"original{path.suffix}"
             file.write_bytes(row["copy"])
-            return _mesh_of(file, row["name"])
+            try:
+                return _mesh_of(file, row["name"])
+            except JaxmarkError as error:
+                said = str(error).replace(str(file), f"the copy of {path} in the catalogue {self.database.path}")
+                raise JaxmarkError(said) from None
 
     def find(self, suspect: str | os.PathLike[str] | Mesh, keys: Sequence[bytes], **options: Any) -> Verdict:
         """Find the originals that a suspect was made from.

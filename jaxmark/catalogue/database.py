@@ -123,7 +123,8 @@ class Database:
     def each(self, statement: str, *values: object) -> Iterator[sqlite3.Row]:
         """Yield the rows of a query one after the other, which saves memory for large results; see `rows`."""
         with self._clear_errors():
-            yield from self._connection.execute(statement, values)
+            # Unlike the cursor, this iterator is not closed with the generator, perhaps after the connection was.
+            yield from iter(self._connection.execute(statement, values).fetchone, None)
 
     def run(self, statement: str, *values: object) -> int:
         """Change rows, within `writing`, and return the number of changed rows; see `rows`."""

@@ -17,7 +17,9 @@ from jaxmark.errors import JaxmarkError
 from jaxmark.files.atomic import replacing
 from jaxmark.watermark.record import Record
 
-_FORMAT, _FORMAT_VERSION = "jaxmark-catalogue", 1
+_FORMAT, _FORMAT_VERSION = "jaxmark-catalogue", 2
+_OPEN_VERSION = 1  # which does not end with the number of its rows
+_END = "rows"  # the last line has this number, by which a file that was cut is recognised
 _MAX_LINE_BYTES = 2**30
 _TABLES = {"original": "originals", "key": "keys", "record": "records", "copy": "copies", "verdict": "verdicts"}
 # The fields of each kind of row. In records and copies, `original` and `shape` identify a mesh by the hash of its file
@@ -34,6 +36,8 @@ _FIELDS: dict[str, dict[str, Any]] = {
     "copy": dict.fromkeys(("original", "shape", "key", "recipient", "record", "file", "added"), str),
     "verdict": dict.fromkeys(("suspect", "path", "given", "versions", "result"), str),
 }
+_KEY, _RECORD = ("key", "keys", "commitment"), ("record", "records", "digest")
+_REFERENCES = {"record": (_KEY,), "copy": (_KEY, _RECORD)}  # fields that refer to a row, its table and its column
 _SHAPE: dict[str, Any] = {
     **dict.fromkeys(("name", "geometry", "exact"), str),
     **dict.fromkeys(("vertices", "faces", "described"), int),
@@ -64,6 +68,7 @@ def export_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
                 for kind, row in _rows(catalogue.database):
                     counts[kind] += 1
                     file.write(json.dumps({kind: row}, default=lambda data: base64.b64encode(data).decode()) + "\n")
+                file.write(json.dumps({_END: sum(counts.values())}) + "\n")
                 file.flush()
                 os.fsync(file.fileno())
         except OSError as error:
@@ -102,6 +107,7 @@ def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
         JaxmarkError: if the file cannot be read, or is no export, or a line of it is damaged; then nothing is imported.
     """
     counts = dict.fromkeys(_TABLES, 0)
+    number, version, is_complete = 0, 0, False
     with catalogue.database.writing():
         for number, line in enumerate(_lines(path), 1):
             try:
@@ -109,14 +115,22 @@ def import_catalogue(catalogue: Catalogue, path: str | os.PathLike[str]) -> Coun
                 if number == 1:
                     if data.get("format") != _FORMAT:
                         raise JaxmarkError("it is not the export of a catalogue")
-                    if data.get("version") != _FORMAT_VERSION:
+                    if data.get("version") not in (_OPEN_VERSION, _FORMAT_VERSION):
                         raise JaxmarkError(f"this jaxmark cannot read the version {data.get('version')} of the export")
+                    version = data["version"]
                     continue
                 ((kind, row),) = data.items()
+                if version == _FORMAT_VERSION and (is_complete or kind == _END):
+                    if is_complete or row != number - 2:
+                        raise JaxmarkError("the file has other rows than were exported")
+                    is_complete = True
+                    continue
                 counts[kind] += _take(catalogue.database, kind, row)
             except (ValueError, KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
                 reason = str(error).rstrip(".") if isinstance(error, JaxmarkError) else "it is damaged"
                 raise JaxmarkError(f"{path} cannot be imported: line {number}: {reason}.") from None
+        if version == _FORMAT_VERSION and not is_complete:
+            raise JaxmarkError(f"{path} cannot be imported: it was cut after line {number}; export it again.")
     return _counted(counts)
 
 
@@ -154,6 +168,9 @@ def _take(database: Database, kind: str, row: Mapping[str, Any]) -> bool:
             query = f"SELECT 1 FROM verdicts WHERE {' AND '.join(f'{name} = ?' for name in values)}"
             if database.rows(query, *values.values()):
                 return False
+    for name, table, column in _REFERENCES.get(kind, ()):
+        if not database.rows(f"SELECT 1 FROM {table} WHERE {column} = ?", values[name]):
+            raise JaxmarkError(f"its {name} is neither in the export nor in the catalogue")
     if "shape" in values:
         query = "SELECT s.id FROM shapes s JOIN originals o ON o.id = s.original WHERE o.content = ? AND s.name = ?"
         shapes = database.rows(query, values.pop("original"), values["shape"])

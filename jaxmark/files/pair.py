@@ -39,11 +39,14 @@ def refuse_existing_pair(file: Path, record: Path, *, overwrite: bool, original:
     a file that refers to the original.
 
     Raises:
-        JaxmarkError: if one of them exists, and may not be replaced, or is in a folder that does not.
+        JaxmarkError: if one of them exists, and may not be replaced, is the original, or is in a folder that does not
+            exist.
     """
-    for folder in (file.parent, record.parent):
-        if not folder.is_dir():
-            raise JaxmarkError(f"The folder {folder} does not exist.")
+    for path in (file, record):
+        if not path.parent.is_dir():
+            raise JaxmarkError(f"The folder {path.parent} does not exist.")
+        if original is not None and os.path.realpath(path) == os.path.realpath(original):
+            raise JaxmarkError(f"{path} is the original; give another name, or another folder.")
     came_along = not record.exists() and original is not None and _is_copy(file, original)
     refuse_existing(*([record] if came_along else [file, record]), overwrite=overwrite)
 

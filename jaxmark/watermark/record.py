@@ -192,7 +192,8 @@ class Record:
                 bytes.fromhex(self.imprint["order"]),
             )
             numbers = [imprint.grid, *imprint.centre, *imprint.covariance.flat]
-            is_in_range = np.isfinite(numbers).all() and imprint.grid > 0 and len(tags) > 0
+            # Products of numbers in this range are finite.
+            is_in_range = (np.abs(numbers) < 1e100).all() and imprint.grid > 1e-100 and len(tags) > 0
             if not is_in_range or not _HASH.fullmatch(self.imprint["order"]):
                 raise ValueError("out of range")
             return imprint
@@ -363,11 +364,11 @@ def load_record(path: str | os.PathLike[str]) -> Record | SceneRecord:
     data = read_json(path)
     if not isinstance(data, dict) or data.get("format") != _SCENE_FORMAT:
         return Record.load(path)
-    meshes, code = data.get("meshes"), data.get("code", "")
-    if data.get("version") not in (_OPEN_SCENE_VERSION, _SCENE_VERSION):
-        raise JaxmarkError(
-            f"The record {path} is of version {data.get('version')!r}; this jaxmark reads {_SCENE_VERSION}."
-        )
+    meshes, code, version = data.get("meshes"), data.get("code", ""), data.get("version")
+    if type(version) is not int or version not in (_OPEN_SCENE_VERSION, _SCENE_VERSION):
+        raise JaxmarkError(f"The record {path} is of version {version!r}; this jaxmark reads {_SCENE_VERSION}.")
+    if data.keys() != {"format", "version", "meshes"} | ({"code"} if version == _SCENE_VERSION else set()):
+        raise JaxmarkError(f"The record {path} is damaged: its fields are not those of a record.")
     if not isinstance(meshes, dict) or not meshes:
         raise JaxmarkError(f"The record {path} is damaged: it has no meshes.")
     if not (isinstance(code, str) and code.isascii()):

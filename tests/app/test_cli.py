@@ -212,6 +212,7 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
     record = json.loads(Path("marked.ply.jaxmark.json").read_text())
     Path("other.json").write_text(json.dumps({**record, "original": "00"}))
     mark = ("--key", "owner.key", "--message", MESSAGE)
+    copy = ("model.ply", "--output", "o.ply")
     for arguments, sentence in [
         (("keygen", "owner.key"), "never overwritten"),
         (("embed", "absent.ply", "out.ply", *mark), "absent.ply"),
@@ -254,15 +255,36 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
         (("detect", "marked.ply", *DETECT, "--record", record_name(), "--scheme", "field"), "contradicts the record"),
         (("detect", "marked.ply", *DETECT, "--record", record_name(), "--presence"), "bits, not of a presence mark"),
         (("detect", "marked.ply", "--key", "owner.key", "--record", record_name()), "with the original; give --orig"),
-        (("attack", "model.ply", "out.ply", "noise", "-1"), "not negative, got -1"),
+        (("attack", "model.ply", "out.ply", "noise", "-1"), "number from 0 to .*, got -1"),
         (("catalogue", "import", "model.ply", "--catalogue", "new.db"), "it is not text"),
         (("attack", "model.ply", "out.ply", "melting", "1"), "melting"),
         (("attack", "model.ply", "out.ply", "smoothing", "1.5"), "whole number"),
         (("attack", "model.ply", "out.ply", "noise", "x"), "'x'"),
+        (("attack", "model.ply", "out.ply", "noise", "1e308"), "from 0 to 1e[+]30, got 1e[+]308"),
         (("attack", "model.ply", "out.ply", "noise", "0.1", "smoothing"), "smoothing has no strength; .*: steps"),
         (("nonsense",), "nonsense"),
+        (
+            ("mark-for", "eve", *copy, "--key", "owner.key", "--catalogue", "o.ply.jaxmark.json"),
+            "catalogue and record",
+        ),
+        (
+            ("mark-for", "eve", *copy, "--key", "o.ply.jaxmark.json", "--catalogue", "c.db"),
+            "key and record are",
+        ),
     ]:
         assert re.search(sentence, workshop.refused(*arguments))
+
+
+def test_a_link_among_marked_files_replaces_no_original(workshop: Workshop):
+    """Whoever links to the originals that need no mark would otherwise lose them."""
+    for folder in ("models", "marked"):
+        Path(folder).mkdir()
+    Path("models/a.ply").write_bytes(before := Path("model.ply").read_bytes())
+    Path("marked/a.ply").symlink_to("../models/a.ply")
+    status, said, _ = workshop("embed", "models", "marked", "--key", "owner.key", "--message", MESSAGE, "--overwrite")
+    assert status == 2
+    assert "marked/a.ply is the original; give another name" in said
+    assert Path("models/a.ply").read_bytes() == before
 
 
 def record_name() -> str:

@@ -64,6 +64,7 @@ def test_a_deposit_and_a_request_to_date_it_are_written(workshop: Workshop):
         (("model.ply", "--output", "o.json"), "not a record"),
         (("all.json", "--output", "o.json"), "not a record"),
         ((RECORD[1], "--output", RECORD[1]), "same file"),
+        (("made.json.tsq", "--output", "made.json", "--overwrite"), "request and record 0 are the same file"),
         ((RECORD[1], "--output", "no/o.json"), "no"),
     ]:
         assert sentence in workshop.refused("commit", *arguments)

@@ -233,10 +233,10 @@ def test_the_last_usual_strength_moves_vertices_further_than_the_first(kind, cap
 def test_refusals(cap: Mesh):
     for kind, strength, sentence in [
         ("melting", 1, "there are noise, .*edge-flips"),
-        ("noise", -1, "not negative"),
+        ("noise", -1, "from 0 to"),
         ("noise", float("nan"), "must be a number"),
         ("smoothing", 2.5, "whole number"),
-        ("smoothing", 1e300, "to 100000"),
+        ("smoothing", 1e20, "to 100000"),
         ("quantisation", 0, "1 to 32"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):

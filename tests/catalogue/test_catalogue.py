@@ -135,8 +135,46 @@ def test_what_is_exported_is_imported_once(folder: Path, key: jm.Key):
         Path("cut.jsonl").write_text("\n".join([*lines[:2], lines[2][:99], *lines[3:]]))
         with pytest.raises(jm.JaxmarkError, match="line 3: it is damaged"), jm.Catalogue("third.db") as third:
             import_catalogue(third, "cut.jsonl")
+        for kept, sentence in (
+            (lines[:-1], f"it was cut after line {len(lines) - 1}"),
+            (lines[:1], "it was cut after line 1"),
+            ([*lines[:1], *lines[2:]], "its original is neither in the export nor in the catalogue"),
+            ([*lines[:2], *lines[3:]], "other rows than were exported"),
+            ([line for line in lines if not line.startswith('{"key"')], "its key is neither"),
+            ([*lines, lines[1]], "other rows than were exported"),
+        ):
+            Path("cut.jsonl").write_text("\n".join(kept))
+            with pytest.raises(jm.JaxmarkError, match=sentence), jm.Catalogue("third.db") as third:
+                import_catalogue(third, "cut.jsonl")
         with jm.Catalogue("third.db") as third:
             assert not third.originals()
+
+
+def test_exports_of_the_first_version_are_imported(folder: Path):
+    """They do not end with the number of their rows."""
+    with jm.Catalogue("shop.db") as catalogue, jm.Catalogue("other.db") as other:
+        catalogue.add("large.ply")
+        export_catalogue(catalogue, "all.jsonl")
+        lines = Path("all.jsonl").read_text().splitlines()
+        Path("old.jsonl").write_text("\n".join([lines[0].replace('"version": 2', '"version": 1'), *lines[1:-1]]))
+        assert import_catalogue(other, "old.jsonl").originals == 1
+
+
+def test_a_damaged_copy_in_the_catalogue_is_named(folder: Path):
+    with jm.Catalogue("shop.db") as catalogue:
+        catalogue.add("tiny.ply", copy=True)
+        catalogue.database.run("UPDATE originals SET copy = x'00'")
+        Path("tiny.ply").unlink()
+        with pytest.raises(jm.JaxmarkError, match=r"the copy of .*tiny\.ply in the catalogue .*shop\.db"):
+            catalogue.load(1)
+
+
+def test_a_query_may_be_left_after_the_catalogue_is_closed(folder: Path):
+    with jm.Catalogue("shop.db") as catalogue:
+        catalogue.add("tiny.ply")
+        rows = catalogue.database.each("SELECT 1 UNION SELECT 2")
+        next(rows)
+    rows.close()
 
 
 def test_catalogues_of_the_first_version_are_brought_up(folder: Path):

@@ -322,7 +322,7 @@ def test_copies_are_issued_and_traced(workshop: Workshop):
     assert "exists" in workshop.refused("mark-for", "alice", "model.ply", *shop)
     assert list(Path().glob("old-*")) == []  # the same copy has the same record
     assert "--output" in workshop.refused("mark-for", "../eve", "model.ply", *shop)
-    assert "the original" in workshop.refused("mark-for", "eve", "model.ply", *shop, "--output", "model.ply")
+    assert "same file" in workshop.refused("mark-for", "eve", "model.ply", *shop, "--output", "model.ply")
     assert "copy for alice" in workshop.json("catalogue", "add", "model-alice.ply", *shop[2:], status=2)["refused"]
     shown = workshop.json("catalogue", "show", "model.ply", *shop[2:])
     assert [one["recipient"] for one in shown["shapes"][0]["copies"]] == ["alice", "bob"]

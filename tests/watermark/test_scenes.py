@@ -264,7 +264,14 @@ def test_records_of_files(marked, tmp_path: Path):
     assert again.to_json() == record.to_json()
     assert again.digest() == record.digest()
     data = json.loads(record.to_json())
-    for change in ({"meshes": {}}, {"version": 9}, {"meshes": {"left": {**data["meshes"]["left"], "bits": "x"}}}):
+    for change in (
+        {"meshes": {}},
+        {"version": 9},
+        {"version": True},
+        {"version": 1},
+        {"x": 0},
+        {"meshes": {"left": {**data["meshes"]["left"], "bits": "x"}}},
+    ):
         (tmp_path / "b.json").write_text(json.dumps({**data, **change}))
         with pytest.raises(jm.JaxmarkError, match="record"):
             load_record(tmp_path / "b.json")
