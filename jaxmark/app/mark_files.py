@@ -24,7 +24,7 @@ from jaxmark.watermark.mark import EmbedInfo
 from jaxmark.watermark.markers import Marker, prepare
 from jaxmark.watermark.perception.budget import Bounds, Budget, excesses
 from jaxmark.watermark.perception.capacity import Survival
-from jaxmark.watermark.record import SceneRecord, read_json
+from jaxmark.watermark.record import SceneRecord, looks_like_record
 from jaxmark.watermark.schemes.passband import ADAPTIVE
 from jaxmark.watermark.schemes.registry import DEFAULT_SCHEME, AnyScheme, name_of
 from jaxmark.watermark.tracing.tracer import make_tracer
@@ -92,7 +92,7 @@ def mark_file(
     if (message is None) == (recipient is None):
         raise JaxmarkError("Give one of --message, --text, --presence and --recipient.")
     refuse_existing_pair(marked, record, overwrite=overwrite, original=original)
-    if record.is_file() and read_json(record) is None:
+    if record.is_file() and not looks_like_record(record):
         raise JaxmarkError(f"{record} is no record, so it is not replaced by one; give another name by --record.")
     doing(f"reading {original}")
     scene = pick(load_scene(original), meshes, original)

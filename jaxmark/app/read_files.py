@@ -105,9 +105,11 @@ class FileReader:
             what = "blind; leave out" if original is not None else "read with the original; give"
             raise JaxmarkError(f"{record}: the mark of this record is {what} --original.")
         if original is None:
-            return self._outcome(_with_caveats(self._read_blind(suspect, loaded), caveats), suspect, loaded)
+            return self._outcome(self._read_blind(suspect, loaded, caveats), suspect, loaded)
         self.doing(f"reading {suspect} and {original}")
         if isinstance(loaded, Record):  # a record of the whole file
+            if self.meshes:
+                raise JaxmarkError(f"{record} is the record of a whole file; leave out --mesh.")
             name, original_mesh, marked = "", load_mesh(original), loaded.meshes
         else:
             scene = load_scene(original)
@@ -175,7 +177,7 @@ class FileReader:
         lines = detection_lines(detection, self.alpha, timestamped, charges=self.shows_charges)
         return FileOutcome(values, lines, detection_status(detection, self.alpha))
 
-    def _read_blind(self, suspect: Path, record: Record | SceneRecord | None) -> Detection:
+    def _read_blind(self, suspect: Path, record: Record | SceneRecord | None, caveats: tuple[str, ...]) -> Detection:
         """Read a file without its original; if it has several meshes, read the selected ones, or else the largest.
 
         The charge is for all meshes that could have been selected, because a user may try one after another.
@@ -209,7 +211,7 @@ class FileReader:
         def read(name: str, entry: Record | None) -> Detection:
             release_programs()
             options = {"bits": self.bits, "message": self.message, "record": entry, "schemes": schemes}
-            each[name].append(read_blind(meshes[name], self.key, **options))
+            each[name].append(_with_caveats(read_blind(meshes[name], self.key, **options), caveats))
             return each[name][-1]
 
         tries = len(readable) * len(records)
@@ -235,9 +237,9 @@ class FileReader:
                 names = ", ".join(map(repr, marked))
                 raise JaxmarkError(f"The record has no mesh {name!r}, which --mesh selects; it has {names}.")
         names = list(dict.fromkeys(self.meshes or marked))
-        for name in names:
-            if record is not None and not find_name(name, known):
-                raise JaxmarkError(f"{original} lacks the mesh {name!r} of the record; give the file that was marked.")
+        for name in names if record is not None and not self.meshes else ():
+            if name not in known:
+                raise JaxmarkError(f"{original} lacks the mesh {name!a} of the record; give the file that was marked.")
         return list(pick(scene, names, original).meshes)
 
     def _read_scene(self, suspect: Path, original: Scene, record: SceneRecord | None) -> Detection:

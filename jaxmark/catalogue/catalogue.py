@@ -63,7 +63,7 @@ class Catalogue:
     """
 
     def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
-        """Open a catalogue; if it does not exist, create it, unless it is opened for reading only.
+        """Open a catalogue. A new file is created by the first addition, unless it is opened for reading only.
 
         Raises:
             JaxmarkError: if the file cannot be opened, is no catalogue, or was made by a later version of jaxmark.

@@ -88,7 +88,7 @@ class Database:
     """A connection to a catalogue's file, for use by one thread at a time."""
 
     def __init__(self, path: str | os.PathLike[str], *, read_only: bool = False) -> None:
-        """Open the file; if it does not exist, create it, unless it is opened for reading only.
+        """Open the file. One that does not exist is created by the first change, unless it is opened for reading only.
 
         Raises:
             JaxmarkError: if the file cannot be opened, is no catalogue, or has a later version.
@@ -99,13 +99,8 @@ class Database:
             raise JaxmarkError(f"There is no catalogue {path}; create one by `jaxmark catalogue add`.")
         if not self.path.parent.is_dir():
             raise JaxmarkError(f"The folder {self.path.parent} of the catalogue does not exist; create it first.")
-        with self._clear_errors():
-            self._connection = self._connect()
-            try:
-                self._prepare()
-            except BaseException:
-                self._connection.close()
-                raise
+        self._is_draft = not read_only and not self.path.exists()  # empty, in memory, until there is a file
+        self._open()
 
     def close(self) -> None:
         """Close the connection; unfinished changes are undone."""
@@ -124,12 +119,12 @@ class Database:
         """Yield the rows of a query one after the other, which saves memory for large results; see `rows`."""
         with self._clear_errors():
             # Unlike the cursor, this iterator is not closed with the generator, perhaps after the connection was.
-            yield from iter(self._connection.execute(statement, values).fetchone, None)
+            yield from iter(self._current().execute(statement, values).fetchone, None)
 
     def run(self, statement: str, *values: object) -> int:
         """Change rows, within `writing`, and return the number of changed rows; see `rows`."""
         with self._clear_errors():
-            return self._connection.execute(statement, values).rowcount
+            return self._current().execute(statement, values).rowcount
 
     def insert(self, table: str, values: Mapping[str, object]) -> bool:
         """Insert a row, within `writing`, unless it exists; returns whether it is new; see `rows`."""
@@ -154,6 +149,7 @@ class Database:
         """
         if self.read_only:
             raise JaxmarkError(f"The catalogue {self.path} was opened for reading only; open it without `read_only`.")
+        self._current(create=True)
         with self._transaction("IMMEDIATE"):
             yield
 
@@ -176,12 +172,31 @@ class Database:
         keys = self.rows("PRAGMA foreign_key_check")
         return damages + [f"a row of {row[0]} refers to a row that does not exist" for row in keys]
 
+    def _current(self, *, create: bool = False) -> sqlite3.Connection:
+        """Return the connection; to the file as soon as it exists, or is to be created."""
+        if self._is_draft and (create or self.path.exists()):
+            self.close()
+            self._is_draft = False
+            self._open()
+        return self._connection
+
+    def _open(self) -> None:
+        with self._clear_errors():
+            self._connection = self._connect()
+            try:
+                self._prepare()
+            except BaseException:
+                self._connection.close()
+                raise
+
     def _connect(self) -> sqlite3.Connection:
+        if self._is_draft:
+            return self._connection_to(":memory:")
         if not self.read_only:
-            return self._open(str(self.path))
+            return self._connection_to(str(self.path))
         # SQLite cannot create the index of the log in a folder that is not writable. In this case no process writes the
         # file, so that it can be opened as immutable.
-        connection = self._open(f"{self.path.as_uri()}?mode=ro")
+        connection = self._connection_to(f"{self.path.as_uri()}?mode=ro")
         try:
             connection.execute("SELECT * FROM sqlite_master").fetchone()
             return connection
@@ -190,10 +205,10 @@ class Database:
             log = self.path.with_name(self.path.name + "-wal")
             if not isinstance(error, sqlite3.OperationalError) or log.exists():
                 raise
-            return self._open(f"{self.path.as_uri()}?mode=ro&immutable=1")
+            return self._connection_to(f"{self.path.as_uri()}?mode=ro&immutable=1")
 
     @staticmethod
-    def _open(name: str) -> sqlite3.Connection:
+    def _connection_to(name: str) -> sqlite3.Connection:
         connection = sqlite3.connect(
             name, timeout=_WAIT, isolation_level=None, uri=name.startswith("file:"), check_same_thread=False
         )

@@ -2,6 +2,7 @@
 
 import filecmp
 import os
+import stat
 import time
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -180,7 +181,7 @@ class _Old(NamedTuple):
     def set_aside(self) -> None:
         """Copy an existing record, and then rename an existing file."""
         if self.copy is not None:
-            write_atomically(self.copy, read_file(self.record))
+            write_atomically(self.copy, read_file(self.record), mode=stat.S_IMODE(self.record.stat().st_mode))
         if self.aside is not None:
             self.file.rename(self.aside)
 

@@ -384,6 +384,16 @@ def _payload(bits: int | None) -> str:
     return f"a payload of {bits!r} bits" if bits else "a presence mark"
 
 
+def looks_like_record(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a record, possibly a damaged one, or one of another version.
+
+    Raises:
+        JaxmarkError: see `read_json`.
+    """
+    data = read_json(path)
+    return isinstance(data, dict) and data.get("format") in (_FORMAT, _SCENE_FORMAT)
+
+
 def read_json(path: str | os.PathLike[str]) -> Any:
     """Read the JSON of a record file; None if it contains no JSON.
 

@@ -213,6 +213,7 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
     Path("other.json").write_text(json.dumps({**record, "original": "00"}))
     mark = ("--key", "owner.key", "--message", MESSAGE)
     copy = ("model.ply", "--output", "o.ply")
+    Path("list.json").write_text('{"a": 1}')
     for arguments, sentence in [
         (("keygen", "owner.key"), "never overwritten"),
         (("embed", "absent.ply", "out.ply", *mark), "absent.ply"),
@@ -271,6 +272,10 @@ def test_refusals_are_one_sentence_and_leave_nothing(workshop: Workshop):
             ("mark-for", "eve", *copy, "--key", "o.ply.jaxmark.json", "--catalogue", "c.db"),
             "key and record are",
         ),
+        (("mark-for", "eve", "no.ply", "--output", "o.ply", "--key", "owner.key", "--catalogue", "c.db"), "no.ply"),
+        (("mark-for", "eve", "broken.ply", "--output", "o.ply", "--key", "owner.key", "--catalogue", "c.db"), "broken"),
+        (("detect", "marked.ply", *DETECT, "--record", record_name(), "--mesh", "x"), "leave out --mesh"),
+        (("embed", "model.ply", "out.ply", *mark, "--record", "list.json", "--overwrite"), "list.json is no record"),
     ]:
         assert re.search(sentence, workshop.refused(*arguments))
 
@@ -354,7 +359,8 @@ def test_existing_files_are_refused(workshop: Workshop):
     assert workshop.refused("commit", "second.json", *commit) == refusal.format("commitment.json.tsq")
     workshop.json("commit", "second.json", *commit, "--overwrite")
     assert Path("old-1-commitment.json").read_bytes() == before != Path("commitment.json").read_bytes()
-    jm.Catalogue("shop.db").close()
+    with jm.Catalogue("shop.db") as shop, shop.database.writing():
+        pass
     export = ("catalogue", "export", "first.json", "--catalogue", "shop.db")
     assert workshop.refused(*export) == refusal.format("first.json")
     assert workshop.json(*export, "--overwrite")["originals"] == 0

@@ -169,6 +169,17 @@ def test_a_damaged_copy_in_the_catalogue_is_named(folder: Path):
             catalogue.load(1)
 
 
+def test_a_catalogue_without_a_change_leaves_no_file(folder: Path):
+    with jm.Catalogue("new.db") as catalogue, jm.Catalogue("new.db") as other:
+        with pytest.raises(jm.JaxmarkError, match=r"absent\.ply"):
+            catalogue.add("absent.ply")
+        assert catalogue.originals() == []
+        assert not Path("new.db").exists()
+        assert other.add("tiny.ply").status == "added"
+        assert [Path(entry.path).name for entry in catalogue.originals()] == ["tiny.ply"]
+        assert catalogue.add("tiny.ply").status == "known"
+
+
 def test_a_query_may_be_left_after_the_catalogue_is_closed(folder: Path):
     with jm.Catalogue("shop.db") as catalogue:
         catalogue.add("tiny.ply")
@@ -222,9 +233,10 @@ def test_what_is_no_catalogue_is_refused(folder: Path):
     with closing(sqlite3.connect("foreign.db")) as foreign, foreign:
         foreign.execute("CREATE TABLE things (x)")
     foreign.close()
-    with jm.Catalogue("late.db") as late:
+    with jm.Catalogue("late.db") as late, late.database.writing():
         late.database.run("PRAGMA user_version = 99")
-    jm.Catalogue("damaged.db").close()
+    with jm.Catalogue("damaged.db") as damaged, damaged.database.writing():
+        pass
     data = bytearray(Path("damaged.db").read_bytes())
     data[4096 : len(data)] = os.urandom(len(data) - 4096)
     Path("damaged.db").write_bytes(data)
@@ -241,7 +253,8 @@ def test_what_is_no_catalogue_is_refused(folder: Path):
         damaged.originals()
     with pytest.raises(jm.JaxmarkError, match="There is no catalogue"):
         jm.Catalogue("none.db", read_only=True)
-    jm.Catalogue("good.db").close()
+    with jm.Catalogue("good.db") as good:
+        good.add("tiny.ply")
     with jm.Catalogue("good.db", read_only=True) as good, pytest.raises(jm.JaxmarkError, match="reading only"):
         good.add("tiny.ply")
 

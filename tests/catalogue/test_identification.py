@@ -117,7 +117,8 @@ def test_an_estimate_names_no_original_and_accuses_nobody(workshop: Workshop, mo
     )
     monkeypatch.setattr(Finder, "find", lambda finder, suspect: Verdict("00", (match,), 1))
     shop = ("--key", "owner.key", "--catalogue", "shop.db")
-    jm.Catalogue("shop.db").close()
+    with jm.Catalogue("shop.db") as catalogue, catalogue.database.writing():
+        pass
     found = workshop.json("catalogue", "find", "model.ply", *shop, status=3)
     assert (found["named"], found["estimate"], found["original"]) == (False, True, None)
     found = workshop.json("identify", "model.ply", *shop, status=3)
@@ -355,7 +356,8 @@ def test_what_cannot_be_sought_is_refused(shop: Shop, workshop: Workshop):
                 Finder(catalogue, **({"keys": [shop.key]} | options))
     find = ("catalogue", "find", "model.ply", "--key", "owner.key", "--catalogue")
     assert "There is no catalogue" in workshop.refused(*find, "none.db")
-    jm.Catalogue("empty.db").close()
+    with jm.Catalogue("empty.db") as empty, empty.database.writing():
+        pass
     assert "is empty" in workshop(*find, "empty.db")[2]
 
 

@@ -146,7 +146,9 @@ def test_a_folder_that_stays_locked_is_refused(tmp_path: Path, monkeypatch: pyte
 
 def test_replaced_records_are_kept_unless_they_are_equal(tmp_path: Path) -> None:
     folder = lay(tmp_path / "place", False, False)
-    told = [write(folder, record, overwrite=True) for record in (OLD, OLD, NEW, OLD, OLD)]
+    told = [write(folder, OLD, overwrite=True)]
+    (folder / RECORD).chmod(0o600)
+    told += [write(folder, record, overwrite=True) for record in (OLD, NEW, OLD, OLD)]
     assert [path and path.name for path in told] == [None, None, "old-1-marked.json", "old-2-marked.json", None]
     assert complete(folder, b"new", OLD)
     assert [path.name for path in folder.iterdir() if path.is_file()] == [FILE]
