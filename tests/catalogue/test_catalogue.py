@@ -185,7 +185,7 @@ def test_a_query_may_be_left_after_the_catalogue_is_closed(folder: Path):
         catalogue.add("tiny.ply")
         rows = catalogue.database.each("SELECT 1 UNION SELECT 2")
         next(rows)
-    rows.close()
+    del rows
 
 
 def test_catalogues_of_the_first_version_are_brought_up(folder: Path):
@@ -256,7 +256,7 @@ def test_what_is_no_catalogue_is_refused(folder: Path):
     with jm.Catalogue("good.db") as good:
         good.add("tiny.ply")
     with jm.Catalogue("good.db", read_only=True) as good, pytest.raises(jm.JaxmarkError, match="reading only"):
-        good.add("tiny.ply")
+        good.add("large.ply")
 
 
 def test_commands_answer_for_programs(workshop: Workshop, unchecked):
