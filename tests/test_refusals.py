@@ -11,7 +11,7 @@ import pytest
 import jaxmark as jm
 from jaxmark.attacks import Attack
 from jaxmark.geometry.mesh import Mesh
-from jaxmark.watermark import HostScheme, KeyedScheme, detect_bits, embed_bits, log_evidence
+from jaxmark.watermark import FieldScheme, HostScheme, KeyedScheme, LocalScheme, detect_bits, embed_bits, log_evidence
 from jaxmark.watermark.carriers import KeyedCarrier
 from jaxmark.watermark.record import Record
 from tests.samples import bumpy_sphere
@@ -82,6 +82,9 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
             "has 24 bits, but the payload is 64",
         ),
         (lambda: KeyedScheme(profile=(1.0,) * 65), "A profile is up to 64 finite numbers, .* got 65"),
+        (lambda: LocalScheme(steps=()), r"The steps of 'local' are a tuple of positive numbers, got \(\)"),
+        (lambda: FieldScheme(widths=0.01), "The widths of 'field' are a tuple of positive numbers, got 0.01"),
+        (lambda: FieldScheme(steps=(0.1, -1.0)), r"The steps of 'field' are .*, got \(0.1, -1.0\)"),
         (lambda: KeyedScheme(direction="up"), "direction must be 'coordinates' or 'normals', got 'up'"),
     ],
 )

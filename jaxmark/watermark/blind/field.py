@@ -70,7 +70,8 @@ class FieldScheme(BlindScheme):
     hint: str = ""  # the hint of a record, for reading
 
     def __post_init__(self) -> None:
-        """Check the hint."""
+        """Check the hint, and see `BlindScheme`."""
+        super().__post_init__()
         if self.hint:
             Hint.from_text(self.hint)
 

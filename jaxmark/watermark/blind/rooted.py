@@ -72,7 +72,8 @@ class RootedScheme(BlindScheme):
     unit: str = ""  # the unit of a record, for reading
 
     def __post_init__(self) -> None:
-        """Check the unit."""
+        """Check the unit, and see `BlindScheme`."""
+        super().__post_init__()
         try:
             is_power = not self.unit or _unit_of(float(self.unit)) == float(self.unit)
         except (ValueError, OverflowError):  # zero, negative, infinite, or no number

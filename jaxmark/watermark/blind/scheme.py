@@ -4,8 +4,10 @@ An *anchor* is a place on the surface that a reader finds again without the orig
 anchor, and the mark changes the values. Keyed choices depend on the anchor's *name*. See `docs/blind.md`.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from numbers import Real
 from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -13,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Float64, Int64
 
 from jaxmark.alignment.original import Original
+from jaxmark.errors import JaxmarkError
 from jaxmark.geometry.mesh import Mesh
 from jaxmark.geometry.pose import Pose
 from jaxmark.watermark.coding.keys import Choices
@@ -102,6 +105,17 @@ class BlindScheme(Protocol):
     widths: tuple[float, ...]  # widths of the averages whose differences are the values
     steps: tuple[float, ...]  # quantisation steps of the values
     hiding: bool  # whether displacements are masked perceptually; see `jaxmark.watermark.perception.masking`
+
+    def __post_init__(self) -> None:
+        """Check the lists of widths and steps.
+
+        Raises:
+            JaxmarkError: if one of them is empty, is no tuple, or holds anything but positive numbers.
+        """
+        for name, values in (("widths", self.widths), ("steps", self.steps)):
+            is_list = isinstance(values, tuple) and bool(values)
+            if not is_list or not all(isinstance(value, Real) and 0 < value < math.inf for value in values):
+                raise JaxmarkError(f"The {name} of {self.name!r} are a tuple of positive numbers, got {values!r}.")
 
     @property
     def looks(self) -> int:
