@@ -297,7 +297,7 @@ def _other_reading(record: Record | SceneRecord | None, schemes: Sequence[BlindS
     if hinted := [scheme.name for scheme in schemes or USUAL_BLIND_SCHEMES if "hint" in scheme.remembered]:
         said += (
             "If the suspect is a part, or has more than the marked mesh, give the record: marks of"
-            f" {' and '.join(map(repr, hinted))} are then read only with its hint. The record of several marks has none."
+            f" {' and '.join(map(repr, hinted))} are then read only with its hint. A record of several marks has none."
         )
     return said.rstrip()
 
