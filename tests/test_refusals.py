@@ -1,5 +1,6 @@
 """What people get wrong in Python is told in one sentence of the library's own, when the object is made."""
 
+import json
 import pydoc
 import textwrap
 from collections.abc import Callable
@@ -66,6 +67,11 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.embed(MESH, b"x", KEY, scheme=("keyed", 3)), r"not \('keyed', 3\)"),
         (lambda: jm.embed(MESH, b"x", KEY, scheme=()), r"Several marks in one mesh need .*, not \(\)"),
         (lambda: jm.embed(MESH, b"x", KEY, budget=[]), r"in \(0, 1\), got \[\]"),
+        (lambda: jm.embed(MESH, b"x", KEY, budget={1: 2}), "A metric to limit is a name or a function, got 1"),
+        (lambda: jm.embed(MESH, b"x", KEY, budget=np.array([8e-4])), r"in \(0, 1\), got array"),
+        (lambda: jm.Budget(noise=True), "a number of at least 0, got True"),
+        (lambda: jm.detect(MESH, original=MESH, key=KEY, scheme=5), "A scheme is a name, or one of"),
+        (lambda: jm.detect(MESH, original=MESH, key=KEY, scheme=["keyed"], record=PRESENCE), "A scheme is a name, or"),
         (lambda: jm.Budget(rms="a"), r"in \(0, 1\), got 'a'"),
         (lambda: jm.Budget(noise="a"), "a number of at least 0, got 'a'"),
         (lambda: jm.Budget(limits=["dame"]), r'as a mapping, such as {"dame": 0.01}, got'),
@@ -110,6 +116,16 @@ def test_arrays_of_another_length_are_told(scheme: KeyedScheme | HostScheme):
     ):
         with pytest.raises(jm.JaxmarkError, match=sentence):
             call()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_numbers_of_numpy_and_jax_are_numbers():
+    mesh = bumpy_sphere(3)
+    for rms in (np.float32(1e-3), jnp.float32(1e-3), np.array(1e-3)):
+        marked, info = jm.embed(mesh, b"", KEY, budget=jm.Budget(rms=rms, limits={"dame": np.float32(0.1)}))
+        assert json.loads(info.record.to_json())["bits"] == 0
+    assert jm.detect(marked, original=mesh, key=KEY, bits=np.int64(0), record=info.record).detected()
+    assert jm.detect(marked, original=mesh, key=KEY, bits=np.int64(0)).detected()
 
 
 @pytest.mark.usefixtures("unchecked")

@@ -25,7 +25,7 @@ from jaxmark.geometry.mesh import Mesh, check_mesh, digest
 from jaxmark.watermark.blind import reading as blind_reading
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import KEY_BYTES, Key
-from jaxmark.watermark.coding.message import DEFAULT_BITS, check_size
+from jaxmark.watermark.coding.message import DEFAULT_BITS, check_size, checked_payload
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, united_score, weigh
 from jaxmark.watermark.evidence.ledger import Charge
@@ -234,7 +234,7 @@ def read_blind(
     """
     check_mesh(suspect)
     candidates = schemes or USUAL_BLIND_SCHEMES
-    payload = DEFAULT_BITS if bits is None else bits
+    payload = DEFAULT_BITS if bits is None else checked_payload(bits)
     if record is not None:
         payload = record.payload(key, bits)
         if record.scheme not in BLIND_SCHEMES:

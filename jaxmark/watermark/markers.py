@@ -27,7 +27,7 @@ from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.blind.writing import Writer, remedies
 from jaxmark.watermark.coding import message as coding
 from jaxmark.watermark.coding.keys import Key, commitment
-from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_payload, check_size
+from jaxmark.watermark.coding.message import DEFAULT_BITS, TAG_BITS, check_size, checked_payload
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence
 from jaxmark.watermark.evidence.ledger import Charge, rounded_up
@@ -294,7 +294,8 @@ class BlindMarker:
     @classmethod
     def make(cls, original: Original, key: Key, bits: int, scheme: BlindScheme) -> "BlindMarker":
         """Prepare an original; see `make_blind_marker`."""
-        blind_reading.code_length(bits)  # raises an error unless the payload is a multiple of 8 bits
+        bits = checked_payload(bits)
+        blind_reading.code_length(bits)  # raises an error if the payload is too large
         check_faces("A mark that is read without the original", original.mesh)
         choices = blind_reading.context(key, bits, scheme.name)
         return cls(original, key, bits, scheme, Writer(original, scheme, choices))
@@ -539,7 +540,7 @@ def make_marker(
     key = Key(key)
     check_record(record)
     if bits is not None:
-        check_payload(bits)
+        bits = checked_payload(bits)
     if record is not None:
         bits = record.payload(key, bits)
         if isinstance(scheme, str):

@@ -27,7 +27,7 @@ from jaxmark.watermark.blind.dither import make_dither
 from jaxmark.watermark.blind.scheme import LOOKS_AGAIN, BlindScheme, Look
 from jaxmark.watermark.blind.search import moved, random_changes, reliability, search
 from jaxmark.watermark.coding.keys import Choices, Key, bind
-from jaxmark.watermark.coding.message import check_payload, decode_any, encode
+from jaxmark.watermark.coding.message import checked_payload, decode_any, encode
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection, Evidence, Tag, weigh
 from jaxmark.watermark.evidence.ledger import Choice
@@ -89,7 +89,7 @@ def code_length(bits: int) -> int:
     Raises:
         JaxmarkError: if the payload is not a multiple of 8 bits, negative or too large.
     """
-    check_payload(bits)
+    bits = checked_payload(bits)
     if bits > _MOST_BITS:
         raise JaxmarkError(f"A mark that is read without the original has at most {_MOST_BITS} bits, got {bits}.")
     return 1 << math.ceil(math.log2(_CODE_SPREAD * (bits + TAG_BITS))) if bits else 1

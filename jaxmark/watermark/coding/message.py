@@ -19,14 +19,15 @@ TAG_BITS = 28
 CANDIDATES = 64  # number of candidate messages whose tags the decoder compares
 
 
-def check_payload(bits: int) -> None:
-    """Check the size of a payload.
+def checked_payload(bits: int) -> int:
+    """Check the size of a payload, and return it as a whole number of Python.
 
     Raises:
         JaxmarkError: if it is no whole number of bits, negative, or no multiple of 8.
     """
     if not isinstance(bits, Integral) or bits < 0 or bits % 8:
         raise JaxmarkError(f"The payload must be a multiple of 8 bits, got {bits!r}.")
+    return int(bits)
 
 
 def code_length(bits: int, places: int, spread: int) -> int:
@@ -40,7 +41,7 @@ def code_length(bits: int, places: int, spread: int) -> int:
     Raises:
         JaxmarkError: if the payload is negative or no multiple of 8, or too large for the carrier.
     """
-    check_payload(bits)
+    bits = checked_payload(bits)
     if bits == 0:
         return 1
     information = bits + TAG_BITS

@@ -117,10 +117,17 @@ class Budget:
             if isinstance(metric, str) and metric not in distortion.METRICS:
                 known = ", ".join(distortion.METRICS)
                 raise JaxmarkError(f"There is no metric {metric!r} to limit; the metrics are {known}.")
+            if not isinstance(metric, str) and not callable(metric):
+                raise JaxmarkError(f"A metric to limit is a name or a function, got {metric!r}.")
             if not (_is_number(limit) and 0 < limit < math.inf):
                 raise JaxmarkError(f"The limit of {name_of(metric)} must be a positive number, got {limit!r}.")
         if self.rms is None and self.visibility is None and self.limits is not None and not self.limits:
             raise JaxmarkError("A mark needs a budget or at least one limit.")
+        for name in ("rms", "noise"):
+            object.__setattr__(self, name, _plain(getattr(self, name)))
+        if self.limits is not None:
+            plain = {metric: _plain(limit) for metric, limit in self.limits.items()}
+            object.__setattr__(self, "limits", plain)
 
     @classmethod
     def of(cls, given: "BudgetLike") -> "Budget":
@@ -165,8 +172,13 @@ class Budget:
 
 
 def _is_number(value: Any) -> bool:
-    """Whether a value is a number, also one of NumPy or JAX, and no text."""
-    return isinstance(value, SupportsFloat)
+    """Whether a value is a number, also one of NumPy or JAX, and no text, truth value or list."""
+    return isinstance(value, SupportsFloat) and not isinstance(value, bool) and np.ndim(value) == 0
+
+
+def _plain(value: Any) -> Any:
+    """Convert a number of NumPy or JAX, which records cannot store."""
+    return value if value is None or isinstance(value, int | float) else float(value)
 
 
 #: A budget, or a short form of one: see `Budget`.

@@ -182,4 +182,4 @@ def name_of(scheme: AnyScheme) -> str:
     """Return the name of a scheme, or the names of several, separated by commas."""
     if isinstance(scheme, tuple):
         return ",".join(scheme)
-    return scheme if isinstance(scheme, str) else scheme.name
+    return scheme if isinstance(scheme, str) else (find_blind(scheme) or get_nonblind(scheme)).name
