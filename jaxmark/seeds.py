@@ -13,6 +13,8 @@ from jaxmark.errors import JaxmarkError
 Seed = int | np.integer | Int[Array, ""] | PRNGKeyArray
 Randomness = Seed | np.random.Generator
 
+_SEEDS = 2**32  # of larger seeds, JAX drops the upper half, unless 64-bit types are enabled
+
 # The results of probes affect marks and readings; therefore these seeds must never change.
 _PROBES = {"reception": 0, "detection": 1, "capacity": 2, "channels": 3, "visibility": 4, "tuning": 5}
 
@@ -21,13 +23,13 @@ def random_key(seed: Randomness) -> PRNGKeyArray:
     """Make a JAX random key from a seed; a key is returned unchanged, and a NumPy generator draws a key.
 
     Raises:
-        JaxmarkError: if the seed is neither a whole number of at least 0, nor a key, nor a generator.
+        JaxmarkError: if the seed is neither a whole number from 0 to 2³² - 1, nor a key, nor a generator.
     """
     if isinstance(seed, np.random.Generator):
         return jax.random.key(int(seed.integers(2**31)))
     if isinstance(seed, int | np.integer):
-        if seed < 0:
-            raise JaxmarkError(f"A seed must not be negative, got {seed}.")
+        if not 0 <= seed < _SEEDS:
+            raise JaxmarkError(f"A seed must be from 0 to {_SEEDS - 1}, got {seed}.")
         return jax.random.key(seed)
     if not isinstance(seed, jax.Array | np.ndarray):
         raise JaxmarkError(

@@ -69,6 +69,13 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.embed(MESH, b"x", KEY, budget=[]), r"in \(0, 1\), got \[\]"),
         (lambda: jm.embed(MESH, b"x", KEY, budget={1: 2}), "A metric to limit is a name or a function, got 1"),
         (lambda: jm.embed(MESH, b"x", KEY, budget=np.array([8e-4])), r"in \(0, 1\), got array"),
+        (
+            lambda: jm.identify(MESH, ["a"], original=MESH, key=KEY, top=-1),
+            "top is a whole number .*, got -1",
+        ),
+        (lambda: jm.identify(MESH, ["a"], original=MESH, key=KEY, top="x"), "top is a whole number .*, got 'x'"),
+        (lambda: Record.load(None), "A path is needed, got NoneType"),
+        (lambda: jm.attack(MESH, "noise", 0.1, seed=2**70), "A seed must be from 0 to"),
         (lambda: jm.Budget(noise=True), "a number of at least 0, got True"),
         (lambda: jm.detect(MESH, original=MESH, key=KEY, scheme=5), "A scheme is a name, or one of"),
         (lambda: jm.detect(MESH, original=MESH, key=KEY, scheme=["keyed"], record=PRESENCE), "A scheme is a name, or"),
@@ -82,7 +89,7 @@ def mine(mesh: Mesh, strength: float, randomness: object) -> Mesh:
         (lambda: jm.identify(MESH, [], original=MESH, key=KEY), "No recipient is given"),
         (lambda: jm.identify(MESH, None, original=MESH, key=KEY), "Names are a list, got None"),
         (lambda: jm.load_mesh(None), "A path is needed, got NoneType"),
-        (lambda: jm.attack(MESH, "noise", 0.1, seed=-1), "A seed must not be negative, got -1"),
+        (lambda: jm.attack(MESH, "noise", 0.1, seed=-1), "A seed must be from 0 to .*, got -1"),
         (
             lambda: jm.detect(MESH, original=MESH, key=KEY, message=b"abc", bits=64),
             "has 24 bits, but the payload is 64",

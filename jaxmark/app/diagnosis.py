@@ -62,7 +62,7 @@ def diagnose(suspect: Mesh, mark: Mark, align: Align) -> tuple[str, ...]:
             )
     looked_for = f"a message of {mark.bits} bits" if mark.bits else "a presence mark"
     return (
-        f"Without the record, only {looked_for} was looked for: if the message has another size, give that by --bits"
+        f"Without the record, only {looked_for} of this key was looked for: if it has another size, give that by --bits"
         " (a text has 8 bits for each byte). The original must have exactly the coordinates, and the order, in which it"
         " was marked. Blind marks are read without --original, and copies for recipients by `jaxmark identify`.",
     )

@@ -161,7 +161,9 @@ def detection_lines(
         if timestamped is not None:
             text += f", {power(timestamped.log10_p)} if the commitment is older than the suspect"
     notes = detection.notes
-    if status is Status.NOTHING and detection.message is None and detection.claimed is None:
+    # Nothing was read of the original itself, whose estimates are all 0.
+    was_read = detection.scores.any()
+    if status is Status.NOTHING and was_read and detection.message is None and detection.claimed is None:
         notes += ("A claim needs less evidence: if you know the message, give it by --message.",)
     text = " ".join([f"{text} (--alpha {alpha:g})" + "." * bool(notes), *notes])
     if charges:

@@ -21,6 +21,7 @@ from jaxmark.geometry.mesh import Mesh, digest
 from jaxmark.watermark.blind.reading import best_of, try_each
 from jaxmark.watermark.blind.scheme import BlindScheme
 from jaxmark.watermark.coding.keys import Key
+from jaxmark.watermark.coding.message import DEFAULT_BITS
 from jaxmark.watermark.everyday import EQUALS_ANOTHER, alternatives, detect_scene, read_blind, with_blind
 from jaxmark.watermark.evidence import ledger
 from jaxmark.watermark.evidence.detection import Detection
@@ -102,8 +103,12 @@ class FileReader:
             require("jinja2", "plot")
         check_scheme(loaded, self.schemes[0] if self.schemes else None)
         if loaded is not None and (loaded.scheme in BLIND_SCHEMES) != (original is None):
-            what = "blind; leave out" if original is not None else "read with the original; give"
-            raise JaxmarkError(f"{record}: the mark of this record is {what} --original.")
+            advice = (
+                "blind; leave out --original"
+                if original is not None
+                else "read with the original; give --original, or leave out --record, if the mesh also has a blind mark"
+            )
+            raise JaxmarkError(f"{record}: the mark of this record is {advice}.")
         if original is None:
             return self._outcome(self._read_blind(suspect, loaded, caveats), suspect, loaded)
         self.doing(f"reading {suspect} and {original}")
@@ -219,7 +224,10 @@ class FileReader:
         if not self.meshes and len(names) < len(readable):
             note = f"Only the {len(names)} largest of {len(readable)} meshes were read; select others by --mesh."
             best = best._replace(notes=(*best.notes, note))
-        if detection_status(best, self.alpha) is Status.NOTHING and (note := _other_reading(record, schemes)):
+        sizes_open = self.bits is None and self.message is None
+        if detection_status(best, self.alpha) is Status.NOTHING and (
+            note := _other_reading(record, schemes, sizes_open=sizes_open)
+        ):
             best = best._replace(notes=(*best.notes, note))
         parts = [best_of(found, ledger.PARTS, tries) for found in each.values() if found]
         return self._count_proving(best, parts, len(names)) if several else best
@@ -289,11 +297,17 @@ class FileReader:
         return self._last[1]
 
 
-def _other_reading(record: Record | SceneRecord | None, schemes: Sequence[BlindScheme]) -> str:
+def _other_reading(
+    record: Record | SceneRecord | None, schemes: Sequence[BlindScheme], *, sizes_open: bool = False
+) -> str:
     """Say which reading may find a mark where a blind one of a record, or of some schemes, found none; "" if none."""
     if record is not None:
         return "Only the mark of the record was looked for; without the record, other blind marks of the key are, too."
-    said = "" if schemes else f"Marks of {DEFAULT_SCHEME!r}, the default scheme, are read only with --original. "
+    said = ""
+    if sizes_open:
+        said += f"Only messages of {DEFAULT_BITS} bits were looked for; give the size of another by --bits. "
+    if not schemes:
+        said += f"Marks of {DEFAULT_SCHEME!r}, the default scheme, are read only with --original. "
     if hinted := [scheme.name for scheme in schemes or USUAL_BLIND_SCHEMES if "hint" in scheme.remembered]:
         said += (
             "If the suspect is a part, or has more than the marked mesh, give the record: marks of"

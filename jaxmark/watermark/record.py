@@ -223,6 +223,8 @@ class Record:
         Raises:
             JaxmarkError: if the file cannot be read, is no record, or has a version that this jaxmark does not know.
         """
+        if not isinstance(path, str | os.PathLike):
+            raise JaxmarkError(f"A path is needed, got {type(path).__name__}.")
         return cls.of(read_json(path), path)
 
     @classmethod

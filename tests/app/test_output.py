@@ -23,7 +23,7 @@ def test_a_detection_says_what_was_read(
     log10_p: float, message: bytes | None, claimed: bytes | None, start: str, advised: bool
 ):
     """A claim that is proven is named, and one is advised where nothing was found without it."""
-    found = Detection(message, Evidence(log10_p), None, np.zeros(1), None, "field", claimed=claimed)
+    found = Detection(message, Evidence(log10_p), None, np.ones(1), None, "field", claimed=claimed)
     (line,) = detection_lines(found, 1e-6, None)
     assert line.startswith(start)
     assert (ADVICE in line) == advised
@@ -38,7 +38,7 @@ def test_a_detection_says_what_was_read(
 )
 def test_a_bound_of_one_has_no_conditions(log10_p: float, end: str):
     evidence = Evidence(log10_p, log10_p / 2)
-    (line,) = detection_lines(Detection(None, evidence, None, np.zeros(1), None, "field", "key"), 1e-6, None)
+    (line,) = detection_lines(Detection(None, evidence, None, np.ones(1), None, "field", "key"), 1e-6, None)
     assert f"false-positive probability {end}" in line
 
 

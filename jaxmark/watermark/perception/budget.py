@@ -173,7 +173,7 @@ class Budget:
 
 def _is_number(value: Any) -> bool:
     """Whether a value is a number, also one of NumPy or JAX, and no text, truth value or list."""
-    return isinstance(value, SupportsFloat) and not isinstance(value, bool) and np.ndim(value) == 0
+    return isinstance(value, SupportsFloat) and not isinstance(value, bool) and not getattr(value, "ndim", 0)
 
 
 def _plain(value: Any) -> Any:

@@ -7,6 +7,7 @@ recipients' codewords, not that of the chips, because the copies of other recipi
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from numbers import Integral
 
 from jaxmark.alignment import attempts
 from jaxmark.alignment.result import Align, Alignment
@@ -63,12 +64,12 @@ class Tracer:
         self, suspect: Mesh, recipients: Iterable[str], top: int = 10, align: Align = "auto"
     ) -> list[Accusation]:
         """Rank recipients by their scores in a suspect; see `identify`."""
-        names = _names(recipients)  # before the suspect is aligned, which takes long
+        names = _names(recipients, top)  # before the suspect is aligned, which takes long
         return self.rank(self.register(suspect, align), names, top)
 
     def read(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients by their scores in an aligned suspect; see `identify`."""
-        return self.rank(aligned, _names(recipients), top)
+        return self.rank(aligned, _names(recipients, top), top)
 
     def rank(self, aligned: Alignment, recipients: Iterable[str], top: int = 10) -> list[Accusation]:
         """Rank recipients as `read` does, by identifiers that a catalogue holds and that are not normalised again."""
@@ -158,12 +159,14 @@ def identify(
         JaxmarkError: see `make_tracer`; also if the suspect cannot be aligned, there is no recipient, an identifier is
             empty, or two identifiers differ only in what cannot be seen.
     """
-    names = _names(recipients)  # before the original is prepared
+    names = _names(recipients, top)  # before the original is prepared
     return make_tracer(original, key, record=record).identify(suspect, names, top, align)
 
 
-def _names(recipients: Iterable[str]) -> list[str]:
-    """Normalise the identifiers of recipients; refused if there are none."""
+def _names(recipients: Iterable[str], top: int) -> list[str]:
+    """Normalise the identifiers of recipients; refused if there are none, or no recipient is asked for."""
+    if not isinstance(top, Integral) or top < 1:
+        raise JaxmarkError(f"top is a whole number of at least 1, got {top!r}.")
     names = normalise_names(recipients)
     if not names:
         raise JaxmarkError("No recipient is given; give the identifiers of all recipients of a copy.")
