@@ -32,9 +32,11 @@ class Rough(NamedTuple):
 def local_roughness(x: Positions, faces: Int[Array | np.ndarray, "faces 3"]) -> Rough:
     """Difference of each vertex's absolute angle defect from the cotangent-weighted mean of its neighbours'.
 
-    Flat angles sum to π at the vertices of the boundary.
+    Flat angles sum to π at the vertices of the boundary. A face that names a vertex twice has no part in the surface.
     """
-    boundary = np.isin(np.arange(len(x)), boundary_vertices(np.asarray(faces)))
+    faces = np.asarray(faces)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
+    boundary = np.isin(np.arange(len(x)), boundary_vertices(faces))
     return _local_roughness(x, jnp.asarray(faces), jnp.asarray(boundary))
 
 

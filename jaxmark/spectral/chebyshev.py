@@ -67,6 +67,8 @@ def filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, 
 @jax.jit
 def _filter(operator: Operator, coefficients: Series, x: Signal) -> Float[Array, " vertices *columns"]:
     x = checked_signal("filter", operator, x)
+    if jnp.iscomplexobj(coefficients):
+        raise JaxmarkError("filter needs real coefficients, got complex ones.")
     c = jnp.asarray(coefficients).astype(x.dtype)
     if c.ndim not in (1, 2) or c.shape[-1] == 0 or (c.ndim == 2 and c.shape[:1] != x.shape[1:]):
         raise JaxmarkError(

@@ -235,8 +235,10 @@ class Laplacian(NamedTuple):
         """Compute the inner product ⟨x, y⟩_M = Σ_v M_v x_v y_v: a scalar for `[N]`; `[C]`, by columns, for `[N, C]`.
 
         Raises:
-            JaxmarkError: if the shapes differ.
+            JaxmarkError: if the shapes differ, or the values are neither float32 nor float64.
         """
+        check_precision("Laplacian.inner", x)
+        check_precision("Laplacian.inner", y)
         if x.shape != y.shape:
             raise JaxmarkError(f"Laplacian.inner needs two signals of one shape, got {x.shape} and {y.shape}.")
         return jnp.sum(per_row(self.mass, x) * x * y, axis=0)
@@ -342,15 +344,23 @@ def checked_signal(name: str, operator: Operator, x: Array | np.ndarray) -> Arra
 
 
 def centre(
-    operator: Laplacian, x: Float[Array | np.ndarray, "vertices columns"]
-) -> Float64[np.ndarray, "vertices columns"]:
+    operator: Laplacian, x: Float[Array | np.ndarray, " vertices *columns"]
+) -> Float64[np.ndarray, " vertices *columns"]:
     """Subtract the M-weighted mean of each connected component, on the host in float64.
 
     The result has no part in the null space of Δ, so that a filtered signal does not depend on where the object, or any
     piece of it, is placed. Centre before casting to float32, or large offsets eat the digits. An isolated vertex
     becomes 0.
+
+    Raises:
+        JaxmarkError: if the signal is not `[N]` or `[N, C]`.
     """
-    x = np.asarray(x, np.float64)
+    shape, x = np.shape(x), np.asarray(x, np.float64)
+    if x.ndim not in (1, 2) or len(x) != operator.mass.shape[0]:
+        raise JaxmarkError(f"centre needs a signal [N] or [N, C], N = {operator.mass.shape[0]} vertices, got {shape}.")
+    if not x.size:
+        return x
+    x = x.reshape(len(x), -1)
     mass = np.asarray(operator.mass, np.float64)
     size = len(mass)
     pairs, weights = host_edges(operator)
@@ -362,7 +372,7 @@ def centre(
     total = np.bincount(component, mass, count)[:, None]
     for _ in range(2):  # the second pass removes the rounding errors that the first leaves at large offsets
         x = x - (np.stack([np.bincount(component, mass * column, count) for column in x.T], axis=1) / total)[component]
-    return x
+    return x.reshape(shape)
 
 
 def sparse_matrices(operator: Laplacian) -> tuple[sparse.csr_array, sparse.dia_array]:

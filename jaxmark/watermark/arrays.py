@@ -116,8 +116,10 @@ def make_batch(mark: Mark, message: bytes, keys: Sequence[bytes]) -> MarkBatch:
         leaves = jax.tree.leaves(own._replace(reader=mark.reader.with_carrier(other.carrier), codeword=codeword))
         pairs = enumerate(zip(leaves, reference, strict=True))
         differing.append({k: leaf for k, (leaf, ref) in pairs if leaf is not ref and not np.array_equal(leaf, ref)})
-    # All other arrays are those of the original and of the scheme.
-    is_keyed = [any(k in leaves for leaves in differing) for k in range(len(reference))]
+    # All other arrays are those of the original and of the scheme. The codeword always counts as keyed, so that a batch
+    # of the mark's own key alone knows its size.
+    codeword = next(k for k, leaf in enumerate(reference) if leaf is own.codeword)
+    is_keyed = [k == codeword or any(k in leaves for leaves in differing) for k in range(len(reference))]
     stacks = [np.stack([leaves.get(k, ref) for leaves in differing]) for k, ref in enumerate(reference) if is_keyed[k]]
     shared = tuple(ref for k, ref in enumerate(reference) if not is_keyed[k])
     return MarkBatch(tuple(jax.device_put(stacks)), shared, (structure, tuple(is_keyed)))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from jaxmark.alignment.observation import observe
 from jaxmark.errors import JaxmarkError
+from jaxmark.spectral.precision import check_precision
 from jaxmark.watermark.carriers import Carrier
 from jaxmark.watermark.interfaces import Detector, Strength
 from jaxmark.watermark.reading.detectors import claims
@@ -65,7 +66,7 @@ def detect_bits(
         Soft decisions, `[k]`.
 
     Raises:
-        JaxmarkError: if an argument has a wrong shape.
+        JaxmarkError: if the suspect is neither float32 nor float64, or an argument has a wrong shape.
     """
     _check_suspect(suspect, x, weights, normals)
     reader = carrier.reader()
@@ -125,6 +126,7 @@ def _check_bits(bits: Float[Array, " bits"], carrier: Carrier) -> None:
 
 
 def _check_suspect(suspect: Array, x: Array, weights: Array | None, normals: Array | None) -> None:
+    check_precision("a suspect", jnp.asarray(suspect))
     for name, given, shape in (
         ("the suspect", suspect, jnp.shape(x)),
         ("weights", weights, jnp.shape(x)[:1]),

@@ -424,3 +424,10 @@ def test_faces_whose_corners_coincide_have_no_angles():
     assert plain.inner[both] == hinges.inner[both] == 1
     for name in ("left", "right"):
         assert getattr(plain, name)[both] == getattr(hinges, name)[both]
+
+
+def test_a_face_that_names_a_vertex_twice_changes_no_roughness(pair: tuple[Mesh, Mesh]):
+    """Libraries that weld vertices leave such faces behind."""
+    tail, head = edges(pair[0].faces)[0]
+    more = [mesh._replace(faces=np.vstack([mesh.faces, [[tail, head, head]]])) for mesh in pair]
+    assert jm.compare(*more).fmpd == pytest.approx(jm.compare(*pair).fmpd, rel=1e-6)

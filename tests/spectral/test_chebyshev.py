@@ -352,6 +352,8 @@ def test_refusals(operator, unchecked):
         (lambda: chebyshev.filter(operator, np.ones(0), x), "coefficients"),
         (lambda: chebyshev.filter(operator, np.ones(3), x.astype(int)), "floating"),
         (lambda: chebyshev.moments(operator, x.astype(jnp.bfloat16), degree=3), "float32 or float64, got bfloat16"),
+        (lambda: chebyshev.filter(operator, np.array([1, 1j]), x), "real coefficients"),
+        (lambda: operator.inner(x.astype(jnp.int8), x.astype(jnp.int8)), "float32 or float64, got int8"),
         (lambda: chebyshev.band_components(operator, np.ones((2, 0)), x), r"\[bands, degree \+ 1\]"),
     ]:
         with pytest.raises(JaxmarkError, match=sentence):

@@ -75,6 +75,14 @@ def test_inner_is_weighted_by_row_sums(hard_graph: Mesh, dtype):
     np.testing.assert_allclose(operator.inner(jnp.asarray(x), jnp.asarray(y)), expected, rtol=tolerance(dtype, 10))
 
 
+def test_signals_of_one_column_are_centred_alike(sphere: Mesh, unchecked):
+    operator, x = from_mesh(sphere), np.asarray(sphere.vertices)
+    np.testing.assert_array_equal(centre(operator, x[:, 0]), centre(operator, x)[:, 0])
+    assert centre(operator, x[:, :0]).shape == (len(x), 0)
+    with pytest.raises(JaxmarkError, match=r"centre needs a signal \[N\] or \[N, C\]"):
+        centre(operator, x[1:])
+
+
 def test_cotangents_agree_with_angles(sphere: Mesh):
     operator = from_mesh(sphere, "cotangent")
     angles = trimesh.Trimesh(*sphere, process=False).face_angles

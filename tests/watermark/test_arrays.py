@@ -65,6 +65,13 @@ def test_many_keys_at_once_are_each_of_them(marker: NonBlindMarker):
         marker.arrays_of_keys(b"ok", [])
 
 
+def test_the_own_key_alone_is_a_batch(marker: NonBlindMarker):
+    suspect, own = marker.original.signal, marker.arrays(b"ok")
+    for count in (1, 3):
+        found = marker.arrays_of_keys(b"ok", [marker.key] * count).map(lambda one: one.evidence(suspect))
+        np.testing.assert_allclose(found, [own.evidence(suspect)] * count)
+
+
 def test_one_key_and_many_suspects(marker: NonBlindMarker):
     arrays = marker.arrays(b"ok")
     noise = jax.random.normal(jax.random.key(0), (3, *arrays.x.shape))
