@@ -39,7 +39,7 @@ from scipy import sparse
 from scipy.sparse import csgraph
 
 from jaxmark.distortion.dihedral import MIN_HEIGHT
-from jaxmark.distortion.norms import Positions, Scalar, percentile, ratio, root
+from jaxmark.distortion.norms import Positions, Scalar, check_alike, percentile, ratio, root
 from jaxmark.geometry.mesh import cross_product, face_pairs
 from jaxmark.spectral.bands import diffusion
 from jaxmark.spectral.chebyshev import band_components, filter
@@ -138,7 +138,8 @@ def make_relief(
 
 @jax.jit
 def visible_turn(original: Positions, distorted: Positions, masking: Masking) -> Float[Array, " faces"]:
-    """Compute how visible the turn of each face's normal is, in just noticeable differences."""
+    """Compute how visible the turn of each face's normal is, in just noticeable differences; see `shading`."""
+    check_alike("shading", original, distorted)
     change = _normals(distorted, masking) - _normals(original, masking)
     # Compiled code may round equal positions to different normals. Only the value is mended: the derivative is sound.
     unmoved = jnp.all((original == distorted)[masking.faces], axis=(1, 2))[:, None]
@@ -162,6 +163,9 @@ def shading(original: Positions, distorted: Positions, masking: Masking, share: 
     Hétroy-Wheeler, Dupont, "Just noticeable distortion profile for flat-shaded 3D mesh surfaces", IEEE TVCG 22(11),
     2016; sensitivity by Barten, JOSA A 7(10), 1990). On a plane, a turn of 0.2° is just noticeable, by our calibration.
     The gradient is that of the face at the percentile.
+
+    Raises:
+        JaxmarkError: if the positions differ in shape.
     """
     return percentile(visible_turn(original, distorted, masking), jnp.asarray(masking.area), share)
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxmark.distortion.norms import Positions, Scalar, lengths, ratio
+from jaxmark.distortion.norms import Positions, Scalar, check_alike, lengths, ratio
 from jaxmark.geometry.mesh import edges
 from jaxmark.spectral.laplacian import take_rows
 
@@ -84,7 +84,11 @@ def dame(original: Positions, distorted: Positions, hinges: Hinges) -> Scalar:
     The error is in radians, and independent of scale. It is the paper's sum with masking m = exp((kα)²), k² =
     ln(0.01)/π², by the original's angle α. The paper's visibility weights, which need rendered images, are 1 here.
     Edges of faces that are flat in the original, which have no angle there, do not count.
+
+    Raises:
+        JaxmarkError: if the positions differ in shape.
     """
+    check_alike("dame", original, distorted)
     return dame_from(weighted_angles(original, hinges), distorted, hinges)
 
 

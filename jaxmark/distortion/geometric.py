@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Float64, Int
 from scipy.spatial import KDTree
 
-from jaxmark.distortion.norms import Positions, Scalar, inverse_root, lengths, percentile, ratio, rms
+from jaxmark.distortion.norms import Positions, Scalar, check_alike, inverse_root, lengths, percentile, ratio, rms
 from jaxmark.geometry.clouds import planes, spacings
 from jaxmark.geometry.mesh import Mesh, used_vertices
 from jaxmark.geometry.surfaces import Surface, sample
@@ -69,7 +69,11 @@ def gl(original: Positions, distorted: Positions, edges: Edges) -> Scalar:
     Reference: Karni, Gotsman, "Spectral compression of mesh geometry", SIGGRAPH 2000, section 5. The paper divides the
     roots of sums of squares by the number of vertices. Here they are root mean squares, so that meshes with different
     numbers of vertices are comparable.
+
+    Raises:
+        JaxmarkError: if the positions differ in shape.
     """
+    check_alike("gl", original, distorted)
     change = geometric_laplacian(distorted, edges) - geometric_laplacian(original, edges)
     return jnp.asarray((rms(distorted - original) + rms(change)) / 2)
 
@@ -80,7 +84,11 @@ def stretch(original: Positions, distorted: Positions, edges: Edges, share: floa
 
     Displacements along the surface change lengths, and so textures, where shading hardly changes. Edges of length 0 do
     not count. The gradient is that of the edge at this percentile.
+
+    Raises:
+        JaxmarkError: if the positions differ in shape.
     """
+    check_alike("stretch", original, distorted)
     before, after = (lengths(take_rows(x, edges[:, 0]) - take_rows(x, edges[:, 1])) for x in (original, distorted))
     return percentile(ratio(jnp.abs(after - before), before), (before > 0).astype(before.dtype), share)
 

@@ -8,10 +8,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
+from jaxmark.errors import JaxmarkError
+
 Tree = TypeVar("Tree")
 Positions = Float[Array, "vertices 3"]
 PerVertex = Float[Array, " vertices"]
 Scalar = Float[Array, ""]
+
+
+def check_alike(name: str, original: Positions, distorted: Positions) -> None:
+    """Refuse positions of different meshes: rows that are missing would be read as others, without an error.
+
+    Raises:
+        JaxmarkError: if their shapes differ.
+    """
+    if jnp.shape(original) != jnp.shape(distorted):
+        raise JaxmarkError(
+            f"{name} compares positions of the same vertices, got the shapes {jnp.shape(original)} and"
+            f" {jnp.shape(distorted)}."
+        )
 
 
 def root(square: Any, xp: Any = jnp) -> Any:

@@ -130,6 +130,9 @@ def msdm_views(original: Mesh, distorted: Mesh) -> Views:
 def msdm2_views(original: Mesh, distorted: Mesh) -> Views:
     """Prepare a pair of meshes for `msdm2`: three scales, and vertices compared with closest points of the original.
 
+    The meshes must be welded, as `compare` and `measure` weld them: vertices at one position have neighbourhoods that
+    differ from each other.
+
     Raises:
         JaxmarkError: if libigl is missing.
     """

@@ -29,6 +29,7 @@ from jaxmark.distortion import (
     msdm2_views,
     msdm_views,
     shading,
+    stretch,
     surface_distance,
     tensor_distance,
 )
@@ -431,3 +432,18 @@ def test_a_face_that_names_a_vertex_twice_changes_no_roughness(pair: tuple[Mesh,
     tail, head = edges(pair[0].faces)[0]
     more = [mesh._replace(faces=np.vstack([mesh.faces, [[tail, head, head]]])) for mesh in pair]
     assert jm.compare(*more).fmpd == pytest.approx(jm.compare(*pair).fmpd, rel=1e-6)
+
+
+def test_positions_of_different_meshes_are_no_pair(pair: tuple[Mesh, Mesh], unchecked):
+    """Reading beyond the last row would give a number that looks right."""
+    x, y = (jnp.asarray(mesh.vertices) for mesh in pair)
+    links, hinges = edges(pair[0].faces), make_hinges(pair[0].faces)
+    masking = make_masking(np.asarray(pair[0].vertices), pair[0].faces)
+    for call in (
+        lambda: dame(x, y[:5], hinges),
+        lambda: gl(x[1:], y, links),
+        lambda: stretch(x, y[:5], links),
+        lambda: shading(x, y[1:], masking),
+    ):
+        with pytest.raises(jm.JaxmarkError, match="compares positions of the same vertices, got the shapes"):
+            call()
