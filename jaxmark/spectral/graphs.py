@@ -19,7 +19,7 @@ from scipy.sparse import linalg
 from scipy.spatial import KDTree
 
 from jaxmark.errors import JaxmarkError, require
-from jaxmark.geometry.mesh import Mesh, edges, face_pairs
+from jaxmark.geometry.mesh import Mesh, check_mesh, edges, face_pairs
 from jaxmark.spectral.laplacian import Laplacian, Lowering, graph_laplacian, symmetric_matrix
 from jaxmark.spectral.weights import Negative, cotangent_weights, inverse_length_weights, vertex_areas
 
@@ -72,16 +72,19 @@ def from_mesh(
             this platform.
 
     Raises:
-        JaxmarkError: if a name is unknown, weights or masses are not one for each edge or vertex, finite and not
-            negative, an edge has length zero under `"inverse-length"`, no edge has a positive weight under
-            `"cotangent"`, a vertex with edges has no mass, or the bound is below the spectrum.
+        JaxmarkError: if vertices or faces have other shapes, a face refers to no vertex, a name is unknown, weights or
+            masses are not one for each edge or vertex, finite and not negative, an edge has length zero under
+            `"inverse-length"`, no edge has a positive weight under `"cotangent"`, a vertex with edges has no mass, or
+            the bound is below the spectrum.
     """
     _check_name("Products are lowered by", lowering, Lowering)
+    check_mesh(mesh)
     _check_concrete("from_mesh", "faces", mesh.faces)
     _check_concrete("from_mesh", _TRACED_LATER, weights, mass)
     traced = isinstance(mesh.vertices, Tracer)
     vertices = mesh.vertices if traced else np.asarray(mesh.vertices, np.float64)
     faces = np.asarray(mesh.faces)
+    _check_shapes(vertices, faces)
     if negative == "keep" and mass is None:
         raise JaxmarkError("negative='keep' needs a mass, such as 'areas'; without one the spectrum leaves [0, 2].")
     if isinstance(weights, str) and weights == "robust":
@@ -96,6 +99,8 @@ def from_mesh(
         }
         values = by_name[weights]()
         if values is not None and not traced:
+            if not np.isfinite(positions).all():
+                raise JaxmarkError(f"A position is not finite, which {weights} weights need; mend it.")
             if not np.isfinite(values).all():
                 bad = pairs[int(np.argmax(values))]
                 raise JaxmarkError(f"Edge {bad.tolist()} has length zero; weld its vertices or use valence weights.")
@@ -116,6 +121,19 @@ def from_mesh(
     weighted = graph_laplacian(pairs, len(positions), np.ones(len(pairs)), lowering=lowering)
     weighted = weighted.with_weights(np.ones(len(pairs)) if values is None else values, masses)
     return weighted if masses is None or bound is None else weighted._replace(scale=np.float64(bound / 2))
+
+
+def _check_shapes(vertices: Any, faces: np.ndarray) -> None:
+    """Refuse arrays that are no mesh, as `from_mesh` describes."""
+    if np.ndim(vertices) != 2 or vertices.shape[1] != 3:
+        raise JaxmarkError(f"The vertices of a mesh are an array [N, 3], got the shape {np.shape(vertices)}.")
+    if faces.size and (faces.ndim != 2 or faces.shape[1] != 3 or not np.issubdtype(faces.dtype, np.integer)):
+        raise JaxmarkError(f"The faces of a mesh are whole numbers [F, 3], got {faces.dtype} {faces.shape}.")
+    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices)):
+        bad = faces.max() if faces.max() >= len(vertices) else faces.min()
+        raise JaxmarkError(
+            f"A face refers to vertex {bad}, but the mesh has {len(vertices)} vertices, numbered from 0."
+        )
 
 
 def from_matrices(

@@ -124,8 +124,13 @@ class Laplacian(NamedTuple):
 
         Returns:
             The operator, with the same `scale`: with a mass, the spectrum of M⁻¹(D - W) must stay below twice that.
+
+        Raises:
+            JaxmarkError: if there is not one weight for each edge.
         """
         values = jnp.asarray(weights)
+        if values.shape != self.edges.shape[:1]:
+            raise JaxmarkError(f"The operator has {len(self.edges)} edges; got weights of the shape {values.shape}.")
         degree = sum(jax.ops.segment_sum(values, end, len(self.degree)) for end in jnp.asarray(self.edges).T)
         mass = self.lumped_mass if lumped_mass is None else lumped_mass
         return self._replace(weights=values, degree=degree, lumped_mass=mass)
@@ -137,7 +142,13 @@ class Laplacian(NamedTuple):
 
     @jax.jit
     def apply(self, x: Values) -> Values:
-        """Compute Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`, which must be floating."""
+        """Compute Δx for one signal `[N]` or several `[N, C]`, in the dtype of `x`, which must be floating.
+
+        Raises:
+            JaxmarkError: if the signal has another number of rows, or is not floating.
+        """
+        if x.shape[:1] != self.degree.shape:
+            raise JaxmarkError(f"Laplacian.apply needs a signal of {len(self.degree)} vertices, got {x.shape}.")
         return self.leave(self.product(x)(self.enter(x)))
 
     def product(self, like: Values) -> Callable[[Values], Values]:

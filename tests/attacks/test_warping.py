@@ -189,7 +189,7 @@ def test_warping_is_differentiable(cap: Mesh, x64):
 def test_refusals(cap: Mesh):
     for kind, strength, sentence in [
         ("bending", 361, "0 to 360"),
-        ("warp", -0.1, "not negative"),
+        ("warp", -0.1, "from 0 to"),
         ("jamming", float("inf"), "must be a number"),
         ("twisting", float("nan"), "must be a number"),
     ]:

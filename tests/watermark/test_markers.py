@@ -293,7 +293,7 @@ def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
     for change, sentence in [
         ({"key": jm.new_key()}, "key is not the one"),
         ({"original": marked}, "not the mesh that the record"),
-        ({"bits": 64}, "48 bits according to the record"),
+        ({"bits": 64}, "The record is of a payload of 48 bits"),
         ({"message": b"longer than that"}, "the payload is 48"),
         ({"scheme": EigenScheme()}, "record is of the scheme 'host'"),
     ]:
