@@ -295,7 +295,7 @@ def test_record_binds_and_remembers(sphere: Mesh, key: jm.Key, tmp_path):
         ({"original": marked}, "not the mesh that the record"),
         ({"bits": 64}, "The record is of a payload of 48 bits"),
         ({"message": b"longer than that"}, "the payload is 48"),
-        ({"scheme": EigenScheme()}, "record is of the scheme 'host'"),
+        ({"scheme": EigenScheme()}, "record, whose scheme is 'host'"),
     ]:
         with pytest.raises(jm.JaxmarkError, match=sentence):
             jm.detect(marked, **{"original": sphere, "key": key, "record": record, **change})
