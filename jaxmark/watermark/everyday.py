@@ -256,7 +256,7 @@ def read_blind(
             break
     if record is not None:  # it names the only scheme
         return detections[0]
-    # Whoever names a scheme may have tried the others before.
+    # A reader who names a scheme may have tried the others before.
     return blind_reading.best_of(detections, ledger.BLIND_SCHEME, max(len(BLIND_SCHEMES), len(candidates)))
 
 

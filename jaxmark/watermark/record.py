@@ -223,8 +223,6 @@ class Record:
         Raises:
             JaxmarkError: if the file cannot be read, is no record, or has a version that this jaxmark does not know.
         """
-        if not isinstance(path, str | os.PathLike):
-            raise JaxmarkError(f"A path is needed, got {type(path).__name__}.")
         return cls.of(read_json(path), path)
 
     @classmethod
@@ -400,8 +398,10 @@ def read_json(path: str | os.PathLike[str]) -> Any:
     """Read the JSON of a record file; None if it contains no JSON.
 
     Raises:
-        JaxmarkError: if the file cannot be read, or a name in it has two values.
+        JaxmarkError: if it is no path, the file cannot be read, or a name in it has two values.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise JaxmarkError(f"A path is needed, got {type(path).__name__}.")
     try:
         return json.loads(read_file(path, _MAX_FILE_BYTES), object_pairs_hook=partial(_unique, path))
     except OSError as error:

@@ -160,7 +160,8 @@ def identify(
             empty, or two identifiers differ only in what cannot be seen.
     """
     names = _names(recipients, top)  # before the original is prepared
-    return make_tracer(original, key, record=record).identify(suspect, names, top, align)
+    tracer = make_tracer(original, key, record=record)
+    return tracer.rank(tracer.register(suspect, align), names, top)
 
 
 def _names(recipients: Iterable[str], top: int) -> list[str]:
