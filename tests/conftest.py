@@ -2,6 +2,7 @@
 
 import gc
 import os
+import resource
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -23,6 +24,8 @@ jax.config.update(
     "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
 )
 
+MOST_KIBIBYTES = 3 * 2**20  # of a process, up to which it keeps its programs
+
 
 def pytest_collection_finish() -> None:
     """Look for garbage more rarely: tracing makes many objects, few of which are garbage."""
@@ -43,9 +46,10 @@ def _processors_only(request: pytest.FixtureRequest) -> None:
 
 @pytest.fixture(scope="module", autouse=True)
 def _forget_programs() -> Iterator[None]:
-    """Let compiled programs go with the file of tests that needed them: all of them are gigabytes."""
+    """Let traced and compiled programs go once they are gigabytes; until then, files of tests share them."""
     yield
-    jax.clear_caches()
+    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss > MOST_KIBIBYTES:
+        jax.clear_caches()
 
 
 @pytest.fixture(params=["float32", pytest.param("float64", marks=pytest.mark.double)])
