@@ -310,8 +310,8 @@ def _closest_pairs(
     Returns:
         The source points, the target points, and the root mean square distance of the selected pairs in the pose.
     """
-    to_target = forward.query(pose(source), workers=-1)
-    to_source = backward.query(pose.inverse()(target), workers=-1)
+    to_target = forward.query(pose(source))
+    to_source = backward.query(pose.inverse()(target))
     scale = pose.scale
     pairs = [
         (source, forward.data[to_target[1]], to_target[0]),

@@ -25,6 +25,7 @@ from jaxmark.watermark.evidence.ledger import (
     figure,
     is_charged_along_a_path,
 )
+from jaxmark.watermark.markers import CombinedMarker, make_blind_marker
 from jaxmark.watermark.schemes.registry import BLIND_SCHEMES
 from tests import ROOT
 from tests.samples import bumpy_sphere
@@ -174,10 +175,11 @@ def test_every_detection_is_charged_along_a_path(original: Mesh, marked, key: jm
 def test_detections_of_all_other_kinds_are_charged_along_a_path(original: Mesh, key: jm.Key, monkeypatch):
     # Few steps are sooner written; rooted marks, which are sought last, take long to find.
     usual = BLIND_SCHEMES["field"]
-    monkeypatch.setitem(BLIND_SCHEMES, "field", replace(usual, widths=usual.widths[-1:], steps=usual.steps[4:8]))
+    quick = replace(usual, widths=usual.widths[-1:], steps=usual.steps[4:8], with_hint=False)
     monkeypatch.setattr(RootedScheme, "views", lambda *_: iter(()))
-    field = jm.embed(original, b"blind", key, scheme="field")[0]
-    both = jm.embed(original, b"both", key, scheme=("keyed", "field"))[0]
+    field = make_blind_marker(original, key, bits=40, scheme=quick).embed(b"blind", read_back="never")[0]
+    combined = CombinedMarker(jm.make_marker(original, key, bits=32), (quick,))
+    both = combined.embed(b"both", read_back="never")[0]
     scene = {"a": original, "b": bumpy_sphere(4, seed=3)}
     written, info = jm.watermark.embed_scene(scene, b"scene", key)
     remeshed = jm.attack(jm.embed(original, b"original", key)[0], "simplification", 0.3, seed=0)
