@@ -65,6 +65,11 @@ kernels: $(VENV)/.dev  ## compiled filters beside the rest: faster on processors
 
 notebooks: $(NOTEBOOKS)  ## notebooks with their outputs, as docs/notebooks/*.ipynb
 
+# They share compiled programs with each other and with the tests, see tests/conftest.py.
+$(NOTEBOOKS): export JAX_COMPILATION_CACHE_DIR = $(abspath $(VENV))/.programs
+$(NOTEBOOKS): export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS = 0
+$(NOTEBOOKS): export OPENBLAS_NUM_THREADS = 1
+
 docs/notebooks/%.ipynb: notebooks/%.py | $(VENV)/.docs
 	@echo "running $<, which takes up to two minutes"
 	@mkdir -p $(@D)
